@@ -1,0 +1,1 @@
+"""Sample-efficient model-predictive control with deep Gaussian processes."""

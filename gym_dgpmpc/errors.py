@@ -1,0 +1,25 @@
+"""Named errors, so that a caller can tell what went wrong without reading the message."""
+
+
+class DGPMPCError(Exception):
+    """Base class of the errors this package raises on purpose."""
+
+
+class PlanningError(DGPMPCError, RuntimeError):
+    """No candidate action sequence had a finite score."""
+
+
+class EnvironmentDataError(DGPMPCError, ValueError):
+    """The environment returned something that cannot be learned from (for example a NaN observation)."""
+
+
+class UnknownRewardError(DGPMPCError, ValueError):
+    """The environment offers no reward function and none was given."""
+
+
+class CheckpointError(DGPMPCError, ValueError):
+    """A file is not a checkpoint of this package, is damaged, or was made for other spaces."""
+
+
+class FactorisationError(DGPMPCError, RuntimeError):
+    """A covariance matrix could not be factorised even with the largest jitter."""

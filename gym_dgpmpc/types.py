@@ -1,0 +1,130 @@
+"""The value types and interfaces that connect the parts of the package.
+
+Data flows one way:
+
+    env steps -> TransitionStore -> DynamicsModel.fit -> DynamicsModel.draw -> rollout -> Planner -> action -> env
+
+Everything here is in raw environment units; standardisation and encoding are a model's own business. Sizes in
+the shape annotations: N transitions, S observation size, A action size, K candidate action sequences,
+P particles, H horizon.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+StateDict = dict[str, Tensor | int | float | str]
+"""A flat mapping, dotted keys, of tensors and plain values: what goes into a checkpoint, and nothing else."""
+
+
+class Transitions(NamedTuple):
+    """N observed steps of the environment, float32, raw units; no row crosses an episode boundary."""
+
+    observation: Float[Tensor, "N S"]
+    action: Float[Tensor, "N A"]
+    next_observation: Float[Tensor, "N S"]
+
+
+@dataclass(frozen=True)
+class ObservationSpec:
+    """How a dynamics model should read an observation. All fields are indices into the observation.
+
+    Attributes:
+        angles: enter the model as sine and cosine (the predicted change stays in radians).
+        absolute: the model predicts the next value itself, not the change.
+        not_inputs: predicted, but not fed to the model.
+        constant: fixed within an episode; passed through unmodelled (they stay model inputs unless also in
+            ``not_inputs``).
+    """
+
+    angles: tuple[int, ...] = ()
+    absolute: tuple[int, ...] = ()
+    not_inputs: tuple[int, ...] = ()
+    constant: tuple[int, ...] = ()
+
+
+class RewardFn(Protocol):
+    """The reward r(s_t, a_t, s_{t+1}), batched over any leading dimensions; the same function ``env.step`` uses."""
+
+    def __call__(
+        self,
+        observation: Float[Tensor, "*b S"],
+        action: Float[Tensor, "*b A"],
+        next_observation: Float[Tensor, "*b S"],
+    ) -> Float[Tensor, "*b"]: ...
+
+
+class TerminatedFn(Protocol):
+    """Whether the episode ends in s_{t+1}, batched over any leading dimensions."""
+
+    def __call__(self, next_observation: Float[Tensor, "*b S"]) -> Bool[Tensor, "*b"]: ...
+
+
+class TransitionSampler(Protocol):
+    """One draw of the world, valid for one plan: P particles, each a map (state, action) -> next state.
+
+    ``step`` is the index of the step within the plan, 0 <= step < the horizon the sampler was drawn for; samplers
+    whose functions do not change along a plan ignore it.
+    """
+
+    def __call__(
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
+    ) -> Float[Tensor, "P K S"]: ...
+
+
+@runtime_checkable
+class DynamicsModel(Protocol):
+    """Learns from transitions and draws plausible worlds."""
+
+    def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
+        """Train on all transitions, from the present state of the model; return metrics to log."""
+        ...
+
+    def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
+        """Within an episode: let the posterior follow the grown data, hyperparameters and normaliser frozen."""
+        ...
+
+    def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
+        """Draw one world per particle, for plans of at most ``horizon`` steps."""
+        ...
+
+    def state_dict(self) -> StateDict: ...
+
+    def load_state_dict(self, state: StateDict) -> None: ...
+
+
+Objective = Callable[[Float[Tensor, "K H A"]], Float[Tensor, "K"]]
+"""Scores K candidate action sequences; higher is better; a score that is not finite never wins."""
+
+
+class Plan(NamedTuple):
+    """A diagonal Gaussian over action sequences."""
+
+    mean: Float[Tensor, "H A"]
+    std: Float[Tensor, "H A"]
+
+
+class PlanInfo(NamedTuple):
+    """What a plan found. ``expected_return`` is the mean score of the elites of the last iteration."""
+
+    expected_return: float
+    num_nonfinite: int
+    num_iterations: int
+
+
+class Planner(Protocol):
+    """Improves a plan under an objective; knows neither the model nor the environment."""
+
+    def initial_plan(self) -> Plan: ...
+
+    def plan(self, objective: Objective, plan: Plan, generator: torch.Generator) -> tuple[Plan, PlanInfo]:
+        """Optimise from ``plan``; the result's mean lies within the action bounds."""
+        ...
+
+    def shift(self, plan: Plan, num_actions: int) -> Plan:
+        """The warm start after ``num_actions`` of the plan have been performed."""
+        ...
