@@ -1,1 +1,30 @@
 """Sample-efficient model-predictive control with deep Gaussian processes."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from gym_dgpmpc.envs.registration import register_environments
+
+if TYPE_CHECKING:
+    from gym_dgpmpc.envs import ModCartPoleEnv, SwingUpCartPoleEnv
+
+__all__ = ["ModCartPoleEnv", "SwingUpCartPoleEnv"]
+
+# Public name -> the module it is imported from on first use, so that `import gym_dgpmpc` stays light.
+_MODULE_OF = {
+    "ModCartPoleEnv": "gym_dgpmpc.envs",
+    "SwingUpCartPoleEnv": "gym_dgpmpc.envs",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULE_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+register_environments()
