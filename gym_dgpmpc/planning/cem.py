@@ -1,0 +1,185 @@
+"""The cross-entropy method over action sequences: the planner of the paper, in the variant that PETS runs.
+
+Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials using Probabilistic Dynamics Models"; the
+truncation and the variance cap are in their published code rather than in the text.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gym_dgpmpc.errors import PlanningError
+from gym_dgpmpc.types import Objective, Plan, PlanInfo
+
+TRUNCATION = 2.0  # candidates lie within this many standard deviations of the mean
+
+
+def truncated_normal(
+    shape: tuple[int, ...], generator: torch.Generator, *, device: torch.device, dtype: torch.dtype
+) -> Float[Tensor, "..."]:
+    """Standard normal draws conditioned on |z| <= 2, by the inverse distribution function.
+
+    With U uniform on [-1, 1), z = sqrt(2) erfinv(U erf(2 / sqrt 2)). The argument of erfinv stays within +-0.9545, so
+    no draw is infinite in any precision.
+    """
+    uniform = torch.rand(shape, generator=generator, device=device, dtype=dtype).mul_(2.0).sub_(1.0)
+    noise = uniform.mul_(math.erf(TRUNCATION / math.sqrt(2.0))).erfinv_().mul_(math.sqrt(2.0))
+    return noise.clamp_(-TRUNCATION, TRUNCATION)
+
+
+class CEM:
+    """Cross-entropy method: sample sequences, keep the best, fit a diagonal Gaussian to them, repeat.
+
+    Every plan starts with the standard deviation (high - low) / 4, whatever the plan before it ended with; only the
+    mean is carried from one control step to the next. The result is the mean, not the best sequence sampled.
+
+    Args:
+        action_low, action_high: bounds of the action, [A], finite; their dtype and device are those of the plans.
+        horizon: H, the number of actions in a plan.
+        num_candidates: K, the sequences sampled in each iteration.
+        num_elites: the best of them, to which the Gaussian is fitted.
+        num_iterations: the most iterations a plan takes.
+        smoothing: weight of the old mean and variance in the new ones, in [0, 1).
+        min_std: stop once every action's standard deviation is below this fraction of its range. (PETS stops at the
+            variance 0.001 in the units of the action, which is this default on a range of 6 and never samples at all
+            on a range of 0.1; a fraction does not depend on the units.)
+
+    Raises:
+        ValueError: naming the argument, what was expected and what was received.
+    """
+
+    def __init__(
+        self,
+        *,
+        action_low: Float[Tensor, " A"],
+        action_high: Float[Tensor, " A"],
+        horizon: int,
+        num_candidates: int = 300,
+        num_elites: int = 30,
+        num_iterations: int = 5,
+        smoothing: float = 0.1,
+        min_std: float = 0.005,
+    ):
+        _check_bounds(action_low, action_high)
+        for name, count in (("horizon", horizon), ("num_elites", num_elites), ("num_iterations", num_iterations)):
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, got {count}")
+        if num_elites > num_candidates:
+            raise ValueError(f"num_elites must not exceed num_candidates, got {num_elites} of {num_candidates}")
+        if not 0.0 <= smoothing < 1.0:
+            raise ValueError(f"smoothing must lie in [0, 1), got {smoothing}")
+        if not min_std >= 0.0:
+            raise ValueError(f"min_std must not be negative, got {min_std}")
+        self.action_low = action_low.detach().clone()
+        self.action_high = action_high.detach().clone()
+        self.horizon = horizon
+        self.num_candidates = num_candidates
+        self.num_elites = num_elites
+        self.num_iterations = num_iterations
+        self.smoothing = smoothing
+        self.min_std = min_std
+
+    def initial_plan(self) -> Plan:
+        """The middle of the action range at every step, with the start's standard deviation."""
+        return self._widened(self._midpoint(self.horizon))
+
+    def shift(self, plan: Plan, num_actions: int) -> Plan:
+        """Drop the first ``num_actions`` of the mean, fill its end with the midpoint and widen it again.
+
+        Raises:
+            ValueError: the plan is not of this planner's shape, or has fewer than ``num_actions`` actions.
+        """
+        self._check_plan(plan)
+        if not 0 <= num_actions <= self.horizon:
+            raise ValueError(f"num_actions must lie in 0 to the horizon {self.horizon}, got {num_actions}")
+        return self._widened(torch.cat([plan.mean[num_actions:], self._midpoint(num_actions)]))
+
+    @torch.no_grad()
+    def plan(self, objective: Objective, plan: Plan, generator: torch.Generator) -> tuple[Plan, PlanInfo]:
+        """Maximise ``objective`` from ``plan``.
+
+        A score that is not finite counts as minus infinity and is never an elite; with fewer finite scores than
+        elites, the finite ones alone are fitted.
+
+        Raises:
+            PlanningError: no candidate of an iteration had a finite score.
+            ValueError: ``plan`` or the objective's result has the wrong shape.
+        """
+        self._check_plan(plan)
+        low, high = self.action_low, self.action_high
+        mean, variance = plan.mean.clamp(low, high), plan.std.square()
+        shape = (self.num_candidates, self.horizon, low.shape[0])
+        num_nonfinite = 0
+        for iteration in range(1, self.num_iterations + 1):
+            # Sample candidates from the truncated normal; the cap on its std keeps +-2 std within the bounds, so the
+            # clamp only removes rounding. The cap is for sampling alone and does not enter the recursion below.
+            room = torch.minimum(mean - low, high - mean)
+            std = torch.minimum(variance.sqrt(), room / TRUNCATION)
+            noise = truncated_normal(shape, generator, device=low.device, dtype=low.dtype)
+            candidates = (mean + std * noise).clamp(low, high)
+
+            # Score them and select the elites. topk ranks NaN highest, hence the replacement before it.
+            scores = objective(candidates)
+            if scores.shape != (self.num_candidates,):
+                raise ValueError(f"the objective must return shape ({shape[0]},), got {tuple(scores.shape)}")
+            finite = scores.isfinite()
+            elite_scores, elite_index = scores.masked_fill(~finite, -math.inf).topk(self.num_elites)
+            valid = elite_scores.isfinite()
+            weight = (valid / valid.sum().clamp(min=1)).to(low.dtype)
+            elites = candidates[elite_index]
+
+            # Refit: m <- a m + (1 - a) mean(elites), v <- a v + (1 - a) var(elites), population variance.
+            elite_mean = torch.einsum("e,eha->ha", weight, elites)
+            elite_variance = torch.einsum("e,eha->ha", weight, (elites - elite_mean).square())
+            mean = self.smoothing * mean + (1.0 - self.smoothing) * elite_mean
+            variance = self.smoothing * variance + (1.0 - self.smoothing) * elite_variance
+
+            # All that the host must know, in its one synchronisation of the iteration.
+            narrow = (variance.sqrt() < self.min_std * (high - low)).all()
+            value = elite_scores.masked_fill(~valid, 0.0).sum() / valid.sum()
+            num_finite, is_narrow, expected_return = torch.stack([finite.sum(), narrow, value]).tolist()
+            num_nonfinite += self.num_candidates - int(num_finite)
+            if num_finite == 0:
+                raise PlanningError(
+                    f"none of the {self.num_candidates} candidate action sequences had a finite score in iteration "
+                    f"{iteration} ({num_nonfinite} non-finite scores in this plan); the model or the reward diverges"
+                )
+            if is_narrow:
+                break
+        plan = Plan(mean.clamp(low, high), variance.sqrt())
+        return plan, PlanInfo(expected_return, num_nonfinite, iteration)
+
+    def _midpoint(self, length: int) -> Float[Tensor, "length A"]:
+        return (self.action_low / 2 + self.action_high / 2).expand(length, -1).clone()
+
+    def _widened(self, mean: Float[Tensor, "H A"]) -> Plan:
+        return Plan(mean, ((self.action_high - self.action_low) / 4).expand_as(mean).clone())
+
+    def _check_plan(self, plan: Plan) -> None:
+        expected = (self.horizon, self.action_low.shape[0])
+        for name, value in plan._asdict().items():
+            if value.shape != expected or value.dtype != self.action_low.dtype:
+                raise ValueError(
+                    f"plan.{name} must have shape {expected} and {self.action_low.dtype}, "
+                    f"got {tuple(value.shape)} and {value.dtype}"
+                )
+            if not value.isfinite().all():
+                raise ValueError(f"plan.{name} must be finite, got {value}")
+
+
+def _check_bounds(low: Tensor, high: Tensor) -> None:
+    """Raise ValueError unless the bounds are two finite floating-point vectors in order."""
+    if low.ndim != 1 or low.shape != high.shape or low.shape[0] == 0:
+        raise ValueError(
+            f"action_low and action_high must be vectors of one length, got {tuple(low.shape)} and {tuple(high.shape)}"
+        )
+    if not low.is_floating_point() or low.dtype != high.dtype:
+        raise ValueError(
+            f"action_low and action_high must share one floating-point dtype, got {low.dtype}, {high.dtype}"
+        )
+    if not bool((low.isfinite() & high.isfinite() & (low <= high)).all()):
+        raise ValueError(
+            f"action_low must be finite and nowhere above action_high, got {low.tolist()} and {high.tolist()}"
+        )
