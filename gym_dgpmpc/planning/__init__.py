@@ -1,0 +1,6 @@
+"""Planning: a drawn world and a reward become an objective, and a planner maximises it over action sequences."""
+
+from gym_dgpmpc.planning.cem import CEM
+from gym_dgpmpc.planning.rollout import particle_returns, rollout, rollout_objective
+
+__all__ = ["CEM", "particle_returns", "rollout", "rollout_objective"]

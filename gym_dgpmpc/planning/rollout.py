@@ -1,0 +1,123 @@
+"""From a drawn world and a reward to the planner's objective: action sequences in, expected returns out.
+
+The objective is the Monte Carlo estimate over P particles of the return of H actions from the present observation,
+
+    score(a) = 1/P sum_p sum_{t<H} alive[t, p] r(s[t, p], a[t], s[t+1, p]),
+
+where a particle is alive until, and including, the step in which it terminates.
+"""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gym_dgpmpc.types import Objective, RewardFn, TerminatedFn, TransitionSampler
+
+
+@torch.no_grad()
+def rollout(
+    sampler: TransitionSampler,
+    observation: Float[Tensor, " S"],
+    actions: Float[Tensor, "K H A"],
+    num_particles: int,
+) -> Float[Tensor, "H_plus_1 P K S"]:
+    """The states that K action sequences lead to from one observation, for each of P particles.
+
+    Returns:
+        ``states``, of the observation's dtype and device: ``states[0]`` is the observation, ``states[t + 1]`` the
+        state after action t. With the axes in this order every step writes one contiguous block.
+
+    Raises:
+        ValueError: the sampler's result has the wrong shape (it would be broadcast silently).
+    """
+    num_candidates, horizon, _ = actions.shape
+    states = observation.new_empty(horizon + 1, num_particles, num_candidates, *observation.shape)
+    states[0] = observation
+    for step, action in enumerate(actions.to(states).transpose(0, 1).contiguous()):
+        next_state = sampler(states[step], action, step)
+        if next_state.shape != states[step].shape:
+            raise ValueError(
+                f"the transition sampler must return [P, K, S] = {tuple(states[step].shape)}, "
+                f"got {tuple(next_state.shape)}"
+            )
+        states[step + 1] = next_state
+    return states
+
+
+@torch.no_grad()
+def particle_returns(
+    states: Float[Tensor, "H_plus_1 P K S"],
+    actions: Float[Tensor, "K H A"],
+    reward_fn: RewardFn,
+    terminated_fn: TerminatedFn | None = None,
+) -> Float[Tensor, "P K"]:
+    """The return of every particle of every candidate, with the reward evaluated in one call over [H, P, K].
+
+    The step that terminates earns its reward; whatever the model predicts after it counts for nothing. A particle
+    whose state is not finite while it is alive has the return NaN, even where the reward function would hide that
+    (a comparison with NaN is simply false), so that a diverged particle cannot pass for a good one.
+
+    Raises:
+        ValueError: the reward or the termination has the wrong shape or dtype.
+        TypeError: either is not a tensor.
+    """
+    observation, next_observation = states[:-1], states[1:]
+    batch = next_observation.shape[:-1]
+    action = actions.to(states).transpose(0, 1).unsqueeze(1).expand(*batch, -1)
+    reward = reward_fn(observation, action, next_observation)
+    _check_output("reward_fn", reward, batch, "floating-point")
+    diverged = ~next_observation.isfinite().all(dim=-1)
+    reward = reward.to(states.dtype).masked_fill(diverged, torch.nan)
+    if terminated_fn is not None:
+        terminated = terminated_fn(next_observation)
+        _check_output("terminated_fn", terminated, batch, "boolean")
+        reward = reward.masked_fill(~_alive(terminated), 0.0)
+    return reward.sum(dim=0)
+
+
+def rollout_objective(
+    sampler: TransitionSampler,
+    reward_fn: RewardFn,
+    observation: Float[Tensor, " S"],
+    num_particles: int,
+    terminated_fn: TerminatedFn | None = None,
+) -> Objective:
+    """The planner's objective: the mean over the particles of the return from ``observation``.
+
+    One particle that is not finite makes its candidate's score not finite; none is ever left out of the mean.
+
+    Raises:
+        ValueError: ``num_particles`` is not positive or ``observation`` not a floating-point vector.
+    """
+    if num_particles < 1:
+        raise ValueError(f"num_particles must be at least 1, got {num_particles}")
+    if observation.ndim != 1 or not observation.is_floating_point():
+        raise ValueError(
+            f"observation must be a floating-point vector, got shape {tuple(observation.shape)}, {observation.dtype}"
+        )
+
+    def score(actions: Float[Tensor, "K H A"]) -> Float[Tensor, " K"]:
+        states = rollout(sampler, observation, actions, num_particles)
+        return particle_returns(states, actions, reward_fn, terminated_fn).mean(dim=0)
+
+    return score
+
+
+def _alive(terminated: Bool[Tensor, "H *b"]) -> Bool[Tensor, "H *b"]:
+    """Whether no *earlier* step terminated: the exclusive cumulative product of its negation over the steps."""
+    survived = (~terminated).to(torch.uint8).cumprod(dim=0, dtype=torch.uint8)
+    return torch.cat([torch.ones_like(survived[:1]), survived[:-1]]).bool()
+
+
+def _check_output(name: str, value: object, batch: torch.Size, kind: Literal["floating-point", "boolean"]) -> None:
+    """Check what a user's function returned for a batch of states."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must return a tensor, got {type(value).__name__}")
+    right_kind = value.dtype == torch.bool if kind == "boolean" else value.is_floating_point()
+    if value.shape != batch or not right_kind:
+        raise ValueError(
+            f"{name} must return a {kind} tensor of the batch shape [H, P, K] = {tuple(batch)}, "
+            f"got shape {tuple(value.shape)}, {value.dtype}"
+        )
