@@ -1,0 +1,56 @@
+# `make demo`, `make test` and `make lint` each set up what they need: a virtual environment in .venv that holds this
+# package, editable, and the exact versions of constraints.txt. Nothing is installed outside this folder.
+
+PYTHON ?= python3
+PYTEST_ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+# One thread per process: OpenMP's threads spin while they wait and slow each other down when the cores are shared.
+export OMP_NUM_THREADS ?= 1
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test lint clean
+
+help:
+	@echo "make install   set up .venv with the package and everything its development needs"
+	@echo "make demo      train on ModCartPole-v0 for a few minutes; results in demo/"
+	@echo "make test      lint, then the tests (PYTEST_ARGS=... for pytest)"
+	@echo "make lint      ruff and mypy"
+	@echo "make clean     remove .venv, caches and demo/"
+	@echo "PYTHON=python3.12 make ... chooses the interpreter that .venv is made with (default: python3)"
+
+install: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@if ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	  command -v $(PYTHON) >/dev/null || \
+	    { echo "error: $(PYTHON) was not found; install Python 3.10 or newer, or say PYTHON=/path/to/python3 make ..."; exit 1; }; \
+	  $(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+	    { echo "error: Python 3.10 or newer is needed, but $(PYTHON) is $$($(PYTHON) --version 2>&1); say PYTHON=python3.12 make ..."; exit 1; }; \
+	  $(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
+	    { echo "error: $(PYTHON) cannot make virtual environments; on Debian or Ubuntu: apt-get install python3-venv"; exit 1; }; \
+	  $(PYTHON) -m venv --clear $(VENV); \
+	fi
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[all]'
+	@touch $@
+
+demo: $(INSTALLED)
+	$(BIN)/dgpmpc train ModCartPole-v0 --layers 2 --episodes 6 --seed 0 --out demo
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+# MuJoCo draws off-screen through EGL or OSMesa, whichever works here; with neither, the tests of rendering skip.
+test: lint
+	@gl=$${MUJOCO_GL:-$$($(BIN)/python -m gym_dgpmpc.reporting.rendering)}; \
+	echo "MUJOCO_GL=$$gl"; \
+	MUJOCO_GL=$$gl $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
+
+clean:
+	rm -rf $(VENV) demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
