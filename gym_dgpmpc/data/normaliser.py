@@ -1,0 +1,32 @@
+"""Standardisation of a model's inputs and targets: fitted when a model trains, frozen within an episode."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+class Normaliser(NamedTuple):
+    """An affine map to zero mean and unit standard deviation, per dimension (float64)."""
+
+    mean: Float[Tensor, "D"]
+    std: Float[Tensor, "D"]
+
+    @classmethod
+    def fit(cls, data: Float[Tensor, "N D"]) -> "Normaliser":
+        """Mean and standard deviation of the data.
+
+        A dimension that does not vary beyond the rounding of float32 observations gets unit scale, so that it maps
+        to zero instead of to amplified rounding.
+        """
+        data = data.double()
+        mean, std = data.mean(0), data.std(0, correction=0)
+        rounding = 4 * torch.finfo(torch.float32).eps * data.abs().amax(0)
+        return cls(mean, torch.where(std > rounding.clamp_min(1e-12), std, 1.0))
+
+    def __call__(self, raw: Float[Tensor, "*b D"]) -> Float[Tensor, "*b D"]:
+        return (raw - self.mean) / self.std
+
+    def inverse(self, standardised: Float[Tensor, "*b D"]) -> Float[Tensor, "*b D"]:
+        return standardised * self.std + self.mean

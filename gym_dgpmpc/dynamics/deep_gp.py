@@ -1,0 +1,265 @@
+"""The paper's dynamics model: a deep Gaussian process over transitions, sampled by SG-HMC.
+
+Prepares data for `inference/`, keeps what it returns (hyperparameters, chain, pool of posterior samples), and makes
+the draws of `deep_gp_draws.py` from the pool. The agent calls `fit` at an episode's start, `resample` after each
+control step and `draw` for each plan.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gym_dgpmpc.data.encoding import Encoder
+from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.dynamics.coordinates import Coordinates
+from gym_dgpmpc.dynamics.deep_gp_draws import (
+    DRAWS,
+    REFRESHES,
+    ConditionalSampler,
+    Draw,
+    PathwiseSampler,
+    Posterior,
+    Refresh,
+)
+from gym_dgpmpc.dynamics.deep_gp_start import initial_model, relocate, restandardise
+from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
+from gym_dgpmpc.gp.kernels import Kernel, check_kernel
+from gym_dgpmpc.gp.layer import Layer
+from gym_dgpmpc.inference import mcem, sghmc
+from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
+from gym_dgpmpc.inference.mcem import Data, InferenceSettings
+from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
+
+_NORMALISERS = ("inputs", "targets")
+
+
+class _Fitted(NamedTuple):
+    """What a fit leaves behind, and a `resample` moves on."""
+
+    model: DeepGP
+    normalisers: tuple[Normaliser, Normaliser]
+    chain: sghmc.SGHMCState
+    pool: Tensor  # "num_samples V", a ring
+    oldest: int  # the row of the pool that the next sample replaces
+
+
+class DeepGPDynamics:
+    """Implements `DynamicsModel` with a deep Gaussian process of L layers.
+
+    Args:
+        observation_size: S.
+        action_size: A.
+        observation_spec: how to read the observation.
+        num_layers: L, at least 1.
+        kernel: of every layer, with one lengthscale per input dimension.
+        num_inducing: M, inducing points per layer.
+        draw: "pathwise", "joint" or "marginal"; see `deep_gp_draws`.
+        refresh: for "pathwise": a new function per particle at each "step" of a plan, or one for the whole "plan".
+        num_features: F, random features of a pathwise draw; its prior covariance errs by F^-1/2.
+        first_iterations: training iterations (one SG-HMC and one Adam step each) of the first fit.
+        iterations: training iterations of each later fit.
+        num_samples: size of the pool of posterior samples.
+        sample_spacing: SG-HMC steps between two samples of the pool.
+        resample_steps: SG-HMC steps of one `resample`; 0 leaves the posterior as it is within an episode.
+        relocate: move the inducing inputs to the grown data's cluster centres before each later fit.
+        inference: settings of the sampler and the optimiser.
+        dtype: precision of rollouts; training and every factorisation are in float64.
+        device: where tensors live.
+
+    Raises:
+        ValueError: a setting is out of its range.
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        observation_spec: ObservationSpec | None = None,
+        *,
+        num_layers: int = 2,
+        kernel: str = "matern32",
+        num_inducing: int = 200,
+        draw: Draw = "pathwise",
+        refresh: Refresh = "step",
+        num_features: int = 256,
+        first_iterations: int = 4000,
+        iterations: int = 1000,
+        num_samples: int = 100,
+        sample_spacing: int = 10,
+        resample_steps: int = 5,
+        relocate: bool = True,
+        inference: InferenceSettings | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ):
+        counts = {
+            "num_layers": num_layers, "num_inducing": num_inducing, "num_features": num_features,
+            "first_iterations": first_iterations, "iterations": iterations, "num_samples": num_samples,
+            "sample_spacing": sample_spacing,
+        }
+        for name, value in counts.items():
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, received {value}")
+        if resample_steps < 0:
+            raise ValueError(f"resample_steps must be at least 0, received {resample_steps}")
+        if draw not in DRAWS:
+            raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(DRAWS)}")
+        if refresh not in REFRESHES:
+            raise ValueError(f"unknown refresh {refresh!r}: expected one of {', '.join(REFRESHES)}")
+        self.kernel: Kernel = check_kernel(kernel)
+        self.encoder = Encoder(observation_size, action_size, observation_spec)
+        self.num_layers, self.num_inducing, self.num_features = num_layers, num_inducing, num_features
+        self.draw_kind, self.refresh = draw, refresh
+        self.first_iterations, self.iterations = first_iterations, iterations
+        self.num_samples, self.sample_spacing, self.resample_steps = num_samples, sample_spacing, resample_steps
+        self.relocate = relocate
+        self.inference = inference or InferenceSettings()
+        self.device = torch.device(device)
+        self.dtype = dtype
+        self._fitted: _Fitted | None = None
+        self._factors: list[Tensor] = []  # L_z of every layer; derived from the hyperparameters, so not saved
+
+    def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
+        """Train on all transitions: moving-window MCEM, then a fresh pool of posterior samples.
+
+        The first fit starts from the data, later ones from the present posterior.
+
+        Raises:
+            ValueError: there are no transitions.
+        """
+        x, y = self._encode(data)
+        if x.shape[0] == 0:
+            raise ValueError("cannot fit a dynamics model to 0 transitions")
+        normalisers = Normaliser.fit(x), Normaliser.fit(y)
+        standardised = Data(normalisers[0](x), normalisers[1](y))
+        if self._fitted is None:
+            iterations = self.first_iterations
+            model = initial_model(standardised, self.num_layers, self.num_inducing, generator)
+            whitened = x.new_zeros(model.num_whitened())
+        else:
+            iterations, last = self.iterations, self._fitted
+            model, whitened = restandardise(last.model, last.chain.position, last.normalisers, normalisers)
+            if self.relocate:
+                model, whitened = relocate(self.kernel, model, whitened, standardised, generator)
+        trained = mcem.train(
+            self.kernel, model, sghmc.init(whitened), standardised, iterations, generator, self.inference
+        )
+        chains = list(
+            mcem.sample(
+                self.kernel, trained.model, trained.chain, standardised, self.num_samples, self.sample_spacing,
+                generator, self.inference,
+            )
+        )
+        pool = torch.stack([chain.position for chain in chains])
+        self._fitted = _Fitted(trained.model, normalisers, chains[-1], pool, 0)
+        self._factors = factorise_all(self.kernel, trained.model)
+        return {"negative_log_joint": trained.negative_log_joint, **self._diagnostics(self._fitted)}
+
+    def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
+        """A few SG-HMC steps on the grown data; the newest sample takes the place of the pool's oldest.
+
+        Raises:
+            RuntimeError: the model was not fitted.
+        """
+        fitted = self._require_fit("resample")
+        if self.resample_steps == 0:
+            return {}
+        x, y = self._encode(data)
+        standardised = Data(fitted.normalisers[0](x), fitted.normalisers[1](y))
+        (chain,) = mcem.sample(
+            self.kernel, fitted.model, fitted.chain, standardised, 1, self.resample_steps, generator, self.inference,
+            self._factors,
+        )
+        fitted.pool[fitted.oldest] = chain.position
+        self._fitted = fitted._replace(chain=chain, oldest=(fitted.oldest + 1) % self.num_samples)
+        return {}
+
+    def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
+        """One sample of the pool per particle (distinct while the pool lasts), for plans of ``horizon`` steps.
+
+        Raises:
+            RuntimeError: the model was not fitted.
+        """
+        fitted = self._require_fit("draw")
+        order = torch.randperm(self.num_samples, generator=generator, device=self.device)
+        picked = order.repeat(math.ceil(num_particles / self.num_samples))[:num_particles]
+        whitened = fitted.model.split(fitted.pool[picked])
+        posterior = Posterior(self.kernel, fitted.model, self._factors, whitened)
+        coordinates = Coordinates(self.encoder, *fitted.normalisers, self.dtype)
+        if self.draw_kind == "pathwise":
+            return PathwiseSampler(
+                posterior, coordinates, horizon, self.num_features, self.refresh, self.dtype, generator
+            )
+        return ConditionalSampler(posterior, coordinates, generator, joint=self.draw_kind == "joint")
+
+    def state_dict(self) -> StateDict:
+        """Everything that was learned: hyperparameters, normalisers, the chain and the whole pool. Empty if unfitted."""
+        if self._fitted is None:
+            return {}
+        fitted = self._fitted
+        state: StateDict = {"pool": fitted.pool, "oldest": fitted.oldest, "log_noise": fitted.model.log_noise}
+        for index, layer in enumerate(fitted.model.layers):
+            state |= {f"layers.{index}.{name}": value for name, value in layer._asdict().items()}
+        for name, normaliser in zip(_NORMALISERS, fitted.normalisers, strict=True):
+            state |= {f"{name}.{key}": value for key, value in normaliser._asdict().items()}
+        return state | {f"chain.{name}": value for name, value in fitted.chain._asdict().items()}
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore `state_dict` of a model with the same settings.
+
+        Raises:
+            ValueError: a tensor is missing or has another shape than these settings give it.
+        """
+        if not state:
+            self._fitted, self._factors = None, []
+            return
+        outputs = [self.encoder.input_size] * (self.num_layers - 1) + [self.encoder.target_size]
+        whitened = self.num_inducing * sum(outputs)
+        layer_shapes = ((self.num_inducing, self.encoder.input_size), (self.encoder.input_size,), ())
+
+        def take(name: str, *shape: int) -> Tensor:
+            value = state.get(name)
+            received = tuple(value.shape) if isinstance(value, Tensor) else value
+            if not isinstance(value, Tensor) or value.shape != shape:
+                raise ValueError(f"dynamics state {name!r}: expected a tensor of shape {shape}, received {received}")
+            return value.to(self.device, torch.float64).clone()
+
+        layers = tuple(
+            Layer(*(take(f"layers.{i}.{name}", *shape) for name, shape in zip(Layer._fields, layer_shapes, strict=True)))
+            for i in range(self.num_layers)
+        )
+        sizes = (self.encoder.input_size, self.encoder.target_size)
+        inputs, targets = (
+            Normaliser(*(take(f"{name}.{key}", size) for key in Normaliser._fields))
+            for name, size in zip(_NORMALISERS, sizes, strict=True)
+        )
+        model = DeepGP(layers, take("log_noise", self.encoder.target_size))
+        chain = sghmc.SGHMCState(*(take(f"chain.{name}", whitened) for name in sghmc.SGHMCState._fields))
+        pool = take("pool", self.num_samples, whitened)
+        self._fitted = _Fitted(model, (inputs, targets), chain, pool, int(state["oldest"]))
+        self._factors = factorise_all(self.kernel, model)
+
+    def _encode(self, data: Transitions) -> tuple[Tensor, Tensor]:
+        observation, action, after = (t.to(self.device, torch.float64) for t in data)
+        return self.encoder.inputs(observation, action), self.encoder.targets(observation, after)
+
+    def _require_fit(self, verb: str) -> _Fitted:
+        if self._fitted is None:
+            raise RuntimeError(f"cannot {verb}: the dynamics model has not been fitted to any data yet")
+        return self._fitted
+
+    def _diagnostics(self, fitted: _Fitted) -> dict[str, float]:
+        """Mixing of the kept samples (medians over coordinates), and the fitted noise and kernel scales."""
+        metrics = {
+            "effective_sample_size": float(effective_sample_size(fitted.pool).median()),
+            "gradient_norm": float(fitted.chain.gradient.norm()),
+            "noise_std": float(fitted.model.noise_variance.sqrt().mean()),
+        }
+        if self.num_samples >= 4:
+            metrics["r_hat"] = float(split_r_hat(fitted.pool).median())
+        for index, layer in enumerate(fitted.model.layers):
+            metrics[f"layer_{index + 1}_kernel_std"] = float(layer.variance.sqrt())
+        return metrics

@@ -1,0 +1,105 @@
+"""Where training starts: a deep Gaussian process initialised from data, or carried over to grown data.
+
+Used by `deep_gp.py` at the beginning of every fit.
+"""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.cluster.vq import kmeans2
+from torch import Tensor
+
+from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.gp.deep_gp import DeepGP
+from gym_dgpmpc.gp.kernels import Kernel
+from gym_dgpmpc.gp.layer import Layer, conditional, factorise
+from gym_dgpmpc.inference.mcem import Data
+
+INNER_VARIANCE = 0.01
+NOISE_VARIANCE = 0.05
+
+
+def initial_model(data: Data, num_layers: int, num_inducing: int, generator: torch.Generator) -> DeepGP:
+    """Hyperparameters before the first fit, for standardised data.
+
+    Inducing inputs by k-means of the inputs, in every layer (the inner layers start near the identity); lengthscales
+    sqrt(D); kernel variance 0.01 in the inner layers and 1 in the last; noise variance 0.05 of a target's.
+    """
+    size, options = data.x.shape[1], {"dtype": data.x.dtype, "device": data.x.device}
+    centres = cluster(data.x, num_inducing, generator)
+    log_lengthscale = torch.full((size,), 0.5 * math.log(size), **options)
+
+    def layer(variance: float) -> Layer:
+        return Layer(centres.clone(), log_lengthscale.clone(), torch.tensor(math.log(variance), **options))
+
+    layers = tuple(layer(INNER_VARIANCE) for _ in range(num_layers - 1))
+    return DeepGP((*layers, layer(1.0)), torch.full((data.y.shape[1],), math.log(NOISE_VARIANCE), **options))
+
+
+def cluster(x: Float[Tensor, "N D"], num_clusters: int, generator: torch.Generator) -> Float[Tensor, "M D"]:
+    """M inducing inputs: k-means centres of the rows; where there are fewer rows, also perturbed copies of rows."""
+    num_rows = x.shape[0]
+    if num_rows <= num_clusters:
+        extra = torch.randint(num_rows, (num_clusters - num_rows,), generator=generator, device=x.device)
+        spread = 0.1 * torch.randn(
+            len(extra), x.shape[1], generator=generator, dtype=x.dtype, device=x.device
+        )
+        return torch.cat([x, x[extra] + spread])
+    seed = int(torch.randint(2**31, (), generator=generator, device=x.device))
+    # An empty cluster keeps its last centre, which is as good an inducing input as any.
+    centres, _ = kmeans2(
+        x.cpu().numpy(), num_clusters, iter=10, minit="points", missing="warn", rng=np.random.default_rng(seed)
+    )
+    return torch.from_numpy(centres).to(x)
+
+
+def restandardise(
+    model: DeepGP,
+    whitened: Float[Tensor, "V"],
+    old: tuple[Normaliser, Normaliser],
+    new: tuple[Normaliser, Normaliser],
+) -> tuple[DeepGP, Float[Tensor, "V"]]:
+    """The same function of raw inputs, expressed in new standardised coordinates of inputs and targets.
+
+    Inner layers live in the inputs' coordinates, so their inducing inputs and lengthscales follow the inputs' affine
+    map and their (whitened, hence linear) inducing outputs its scale. The last layer's follow the targets' scale, of
+    which the kernel's variance takes the geometric mean; the shift of the targets' mean is left to training.
+    """
+    stretch = old[0].std / new[0].std
+    shift = (old[0].mean - new[0].mean) / new[0].std
+    stretch_out = old[1].std / new[1].std
+    common = stretch_out.log().mean()
+    layers = [
+        Layer(layer.inducing_inputs * stretch + shift, layer.log_lengthscale + stretch.log(), layer.log_variance)
+        for layer in model.layers
+    ]
+    layers[-1] = layers[-1]._replace(log_variance=layers[-1].log_variance + 2 * common)
+    parts = model.split(whitened)
+    scaled = [v * stretch for v in parts[:-1]] + [parts[-1] * (stretch_out / common.exp())]
+    return (
+        DeepGP(tuple(layers), model.log_noise + 2 * stretch_out.log()),
+        torch.cat([v.flatten() for v in scaled]),
+    )
+
+
+def relocate(
+    kernel: Kernel, model: DeepGP, whitened: Float[Tensor, "V"], data: Data, generator: torch.Generator
+) -> tuple[DeepGP, Float[Tensor, "V"]]:
+    """Move every layer's inducing inputs to where its inputs are now, keeping the function they encode.
+
+    New centres come from k-means of the inputs propagated by the layers' means; the new inducing outputs are the old
+    conditional mean there.
+    """
+    layers, parts, x = [], [], data.x
+    last = len(model.layers) - 1
+    for index, (layer, v) in enumerate(zip(model.layers, model.split(whitened), strict=True)):
+        factor = factorise(kernel, layer)
+        moved = layer._replace(inducing_inputs=cluster(x, layer.inducing_inputs.shape[0], generator))
+        mean, _ = conditional(kernel, layer, factor, v, moved.inducing_inputs)
+        parts.append(torch.linalg.solve_triangular(factorise(kernel, moved), mean, upper=False))
+        layers.append(moved)
+        if index != last:
+            x = x + conditional(kernel, layer, factor, v, x)[0]
+    return DeepGP(tuple(layers), model.log_noise), torch.cat([v.flatten() for v in parts])

@@ -1,0 +1,85 @@
+"""A deep Gaussian process: layers composed, with homoscedastic noise on the last.
+
+f = f_L o ... o f_1 with sparse whitened layers (`layer.py`). Inner layers map the input space to itself with an
+identity mean; the last maps to the targets with mean zero (Salimbeni and Deisenroth 2017). `inference/` samples the
+inducing outputs and fits the hyperparameters of what is defined here; `dynamics/` makes a transition model of it.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gym_dgpmpc.gp.kernels import Kernel
+from gym_dgpmpc.gp.layer import Layer, conditional, factorise
+
+NOISE_FLOOR = 1e-6
+"""Lower bound of the noise variance, in standardised targets: below it single-precision data says nothing."""
+
+
+class DeepGP(NamedTuple):
+    """The hyperparameters {theta, Z, beta} of a deep Gaussian process with L layers, T targets, inputs of size D."""
+
+    layers: tuple[Layer, ...]
+    log_noise: Float[Tensor, "T"]
+
+    @property
+    def noise_variance(self) -> Float[Tensor, "T"]:
+        return NOISE_FLOOR + self.log_noise.exp()
+
+    def output_sizes(self) -> list[int]:
+        """Outputs of each layer: D for the inner ones, T for the last."""
+        inner = [layer.inducing_inputs.shape[1] for layer in self.layers[:-1]]
+        return [*inner, self.log_noise.numel()]
+
+    def split(self, whitened: Float[Tensor, "*p V"]) -> list[Tensor]:
+        """The layers' whitened inducing outputs v_l "*p M_l O_l" as views of one flat vector, as inference keeps it."""
+        shapes = [(layer.inducing_inputs.shape[0], size) for layer, size in zip(self.layers, self.output_sizes(), strict=True)]
+        parts = whitened.split([m * o for m, o in shapes], dim=-1)
+        return [part.unflatten(-1, shape) for part, shape in zip(parts, shapes, strict=True)]
+
+    def num_whitened(self) -> int:
+        """V, the length of the flat vector of all whitened inducing outputs."""
+        return sum(layer.inducing_inputs.shape[0] * o for layer, o in zip(self.layers, self.output_sizes(), strict=True))
+
+    def parameters(self) -> list[Tensor]:
+        """The tensors that the hyperparameter optimiser moves."""
+        return [tensor for layer in self.layers for tensor in layer] + [self.log_noise]
+
+    def detach(self) -> "DeepGP":
+        return DeepGP(tuple(Layer(*(t.detach() for t in layer)) for layer in self.layers), self.log_noise.detach())
+
+
+def factorise_all(kernel: Kernel, model: DeepGP) -> list[Tensor]:
+    """L_z of every layer."""
+    return [factorise(kernel, layer) for layer in model.layers]
+
+
+def propagate(
+    kernel: Kernel,
+    model: DeepGP,
+    factors: list[Tensor],
+    whitened: list[Tensor],
+    x: Float[Tensor, "*p n D"],
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "*p n T"], Float[Tensor, "*p n"]]:
+    """Mean and variance of the last layer, given one sample through each inner layer (its marginals)."""
+    for layer, factor, v in zip(model.layers[:-1], factors[:-1], whitened[:-1], strict=True):
+        mean, variance = conditional(kernel, layer, factor, v, x)
+        noise = torch.randn(mean.shape, generator=generator, dtype=x.dtype, device=x.device)
+        # The floor keeps the square root's gradient finite where the variance vanishes.
+        x = x + mean + variance.clamp_min(1e-12).sqrt().unsqueeze(-1) * noise
+    return conditional(kernel, model.layers[-1], factors[-1], whitened[-1], x)
+
+
+def log_likelihood(
+    model: DeepGP,
+    mean: Float[Tensor, "*p n T"],
+    variance: Float[Tensor, "*p n"],
+    target: Float[Tensor, "n T"],
+) -> Float[Tensor, "*p n"]:
+    """log N(y | mean, variance + noise), summed over the independent targets: the last layer integrated out."""
+    total = variance.unsqueeze(-1) + model.noise_variance
+    return -0.5 * ((target - mean).square() / total + total.log() + math.log(2 * math.pi)).sum(-1)

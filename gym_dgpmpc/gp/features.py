@@ -1,0 +1,46 @@
+"""Random Fourier features: finite-dimensional draws of a stationary Gaussian process's prior.
+
+Sits beside `kernels.py`; the pathwise draws of a trained model are built from them. A stationary kernel is the
+Fourier transform of a spectral density (Bochner), so with frequencies from that density and uniform phases,
+phi_i(x) = sqrt(2 / F) cos(omega_i . x / lengthscale + b_i) has E[phi(x) . phi(x')] = k(x, x')
+(Rahimi and Recht 2007), with an error of order F^-1/2.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gym_dgpmpc.gp.kernels import Kernel, smoothness
+
+
+class Features(NamedTuple):
+    """Frequencies for unit lengthscales, and phases, of F random features over D inputs."""
+
+    frequency: Float[Tensor, "F D"]
+    phase: Float[Tensor, "F"]
+
+    def __call__(self, x: Float[Tensor, "*b D"]) -> Float[Tensor, "*b F"]:
+        """phi(x) for inputs already divided by the lengthscales; unit kernel variance."""
+        return torch.cos(x @ self.frequency.mT + self.phase) * (2.0 / self.phase.numel()) ** 0.5
+
+
+def draw_features(
+    kernel: Kernel, num_features: int, input_size: int, generator: torch.Generator, dtype: torch.dtype = torch.float64
+) -> Features:
+    """Frequencies from the kernel's spectral density, phases uniform over a turn.
+
+    RBF: standard normal. Matern-nu: multivariate Student-t with 2 nu degrees of freedom, that is a standard normal
+    over sqrt(g) with g ~ Gamma(nu, rate nu) shared by the dimensions of one frequency.
+    """
+    device = generator.device
+    frequency = torch.randn(num_features, input_size, generator=generator, dtype=dtype, device=device)
+    order = smoothness(kernel)
+    if order != float("inf"):
+        # 2 nu is a whole number for the kernels here, so the Gamma variate is a mean of squared normals.
+        degrees = round(2 * order)
+        normals = torch.randn(num_features, degrees, generator=generator, dtype=dtype, device=device)
+        frequency = frequency / normals.square().mean(-1, keepdim=True).sqrt()
+    phase = 2 * torch.pi * torch.rand(num_features, generator=generator, dtype=dtype, device=device)
+    return Features(frequency, phase)

@@ -1,0 +1,104 @@
+"""Stationary kernels with ARD as functions of the scaled squared distance r^2 = sum_d (x_d - z_d)^2 / lengthscale_d^2.
+
+The lowest room of the Gaussian-process code: `layer.py` builds covariances from it, `features.py` its spectral
+counterpart. Values and first derivatives are computed together, which is what training spends most of its time on.
+"""
+
+import math
+from typing import Any, Literal, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Kernel = Literal["rbf", "matern52", "matern32", "matern12"]
+
+KERNELS: tuple[Kernel, ...] = get_args(Kernel)
+
+# Matern-1/2 has an infinite slope in r^2 at zero; below this r^2 the slope is taken as that of the floor.
+_SQDIST_FLOOR = 1e-12
+
+_ORDER = {"matern12": 0.5, "matern32": 1.5, "matern52": 2.5}
+
+
+def smoothness(kernel: Kernel) -> float:
+    """The Matern order nu of a kernel; infinite for the RBF."""
+    return _ORDER.get(check_kernel(kernel), math.inf)
+
+
+def check_kernel(kernel: str) -> Kernel:
+    """Return ``kernel`` if it is one of `KERNELS`; otherwise raise a ValueError that names them."""
+    if kernel not in KERNELS:
+        raise ValueError(f"unknown kernel {kernel!r}: expected one of {', '.join(KERNELS)}")
+    return kernel  # type: ignore[return-value]
+
+
+def argument_scale(kernel: Kernel) -> float:
+    """The factor c for which `correlation_` takes c r^2: -1/2 for the RBF, 2 nu for Matern-nu."""
+    return -0.5 if kernel == "rbf" else 2 * _ORDER[kernel]
+
+
+def correlation_(kernel: Kernel, argument: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """k with unit variance from ``argument`` = `argument_scale` * r^2, overwriting it; no gradient.
+
+    The in-place form for rollouts, which fold the factor into a matrix product. Rounding that makes r^2 negative is
+    taken as zero. With s = sqrt(2 nu) r: RBF exp(-r^2/2); Matern-1/2 exp(-s); Matern-3/2 (1 + s) exp(-s);
+    Matern-5/2 (1 + s + s^2/3) exp(-s) (Rasmussen and Williams 2006, eqs. 4.9 and 4.17).
+    """
+    if kernel == "rbf":
+        return argument.clamp_max_(0.0).exp_()
+    s = argument.clamp_min_(0.0).sqrt_()
+    if kernel == "matern12":
+        return s.neg_().exp_()
+    decay = torch.neg(s).exp_()
+    if kernel == "matern32":
+        return torch.addcmul(decay, s, decay, out=s)
+    return torch.addcmul(s, s, s, value=1 / 3).add_(1.0).mul_(decay)
+
+
+def _correlation_and_slope(kernel: Kernel, sqdist: Tensor) -> tuple[Tensor, Tensor]:
+    """k(r^2) and dk/d(r^2) with unit variance."""
+    if kernel == "rbf":
+        value = torch.exp(-0.5 * sqdist.clamp_min(0.0))
+        return value, -0.5 * value
+    order = _ORDER[kernel]
+    s = torch.sqrt(2 * order * sqdist.clamp_min(_SQDIST_FLOOR))
+    decay = torch.exp(-s)
+    if kernel == "matern12":
+        return decay, -0.5 * decay / s
+    if kernel == "matern32":
+        return torch.addcmul(decay, s, decay), -1.5 * decay
+    slope = torch.addcmul(decay, s, decay).mul_(-5 / 6)
+    return torch.addcmul(s, s, s, value=1 / 3).add_(1.0).mul_(decay), slope
+
+
+class _Correlation(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, sqdist: Tensor, kernel: Kernel) -> Tensor:
+        value, slope = _correlation_and_slope(kernel, sqdist)
+        ctx.save_for_backward(slope)
+        return value
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
+        (slope,) = ctx.saved_tensors
+        return grad_outputs[0] * slope, None
+
+
+def correlation(kernel: Kernel, sqdist: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """k(r^2) with unit variance, differentiable once. Formulas as in `correlation_`."""
+    return _Correlation.apply(sqdist, kernel)
+
+
+def scaled_sqdist(
+    x: Float[Tensor, "*b n D"], z: Float[Tensor, "m D"], lengthscale: Float[Tensor, "D"]
+) -> Float[Tensor, "*b n m"]:
+    """r^2 between the rows of ``x`` and ``z``; may be negative by rounding."""
+    x, z = x / lengthscale, z / lengthscale
+    return x.square().sum(-1, keepdim=True) + z.square().sum(-1) - 2.0 * (x @ z.mT)
+
+
+def pairwise_sqdist(x: Float[Tensor, "*b n D"]) -> Float[Tensor, "*b n n"]:
+    """|x_i - x_j|^2 between the rows of ``x`` (already divided by the lengthscales); may be negative by rounding."""
+    square = x.square().sum(-1)
+    return square.unsqueeze(-1) + square.unsqueeze(-2) - 2.0 * (x @ x.mT)

@@ -1,0 +1,40 @@
+"""How well a chain has mixed: effective sample size and split R-hat of the kept samples."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def effective_sample_size(samples: Float[Tensor, "n V"]) -> Float[Tensor, "V"]:
+    """ESS of each coordinate of one chain: n / (1 + 2 sum of autocorrelations), cut off by Geyer's rule.
+
+    The sum runs over pairs of neighbouring lags while the pair is positive (Geyer 1992, initial positive sequence).
+    A coordinate that does not move has an ESS of zero.
+    """
+    n = samples.shape[0]
+    centred = samples.double() - samples.double().mean(0)
+    spectrum = torch.fft.rfft(centred, n=2 * n, dim=0)
+    autocovariance = torch.fft.irfft(spectrum.abs().square(), n=2 * n, dim=0)[:n] / n
+    moving = autocovariance[0] > 0
+    correlation = autocovariance / torch.where(moving, autocovariance[0], 1.0)
+    pairs = correlation[: n - n % 2].reshape(n // 2, 2, -1).sum(1)
+    positive = (pairs > 0).cumprod(0)
+    time = (2.0 * (pairs * positive).sum(0) - 1.0).clamp_min(1.0 / n)
+    return torch.where(moving, n / time, 0.0)
+
+
+def split_r_hat(samples: Float[Tensor, "n V"]) -> Float[Tensor, "V"]:
+    """Split R-hat of each coordinate of one chain: 1 when its two halves agree (Gelman et al. 2013, section 11.4).
+
+    Raises:
+        ValueError: fewer than four samples.
+    """
+    n = samples.shape[0]
+    if n < 4:
+        raise ValueError(f"R-hat needs at least 4 samples, received {n}")
+    half = n // 2
+    halves = torch.stack([samples[:half], samples[n - half :]]).double()
+    within = halves.var(1).mean(0)
+    between = half * halves.mean(1).var(0)
+    pooled = (half - 1) / half * within + between / half
+    return torch.where(within > 0, (pooled / torch.where(within > 0, within, 1.0)).sqrt(), 1.0)

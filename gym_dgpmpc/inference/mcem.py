@@ -1,0 +1,169 @@
+"""Moving-window Monte Carlo EM: SG-HMC over inducing outputs, Adam over hyperparameters, interleaved.
+
+Works on one batch of standardised inputs and targets; `dynamics/deep_gp.py` prepares them and keeps the results.
+The E-step is one SG-HMC step; the M-step is one Adam step on the hyperparameters, inducing inputs and noise under a
+sample drawn uniformly from the window of the latest SG-HMC positions (Havasi et al. 2018, algorithm 1).
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all, log_likelihood, propagate
+from gym_dgpmpc.gp.kernels import Kernel
+from gym_dgpmpc.inference import sghmc
+from gym_dgpmpc.inference.sghmc import SGHMCState
+
+
+@dataclass(frozen=True)
+class InferenceSettings:
+    """Settings of the sampler and the hyperparameter optimiser.
+
+    Attributes:
+        step_size: epsilon of SG-HMC.
+        decay: m, the friction of SG-HMC.
+        learning_rate: of Adam.
+        window_size: number of latest positions the M-step draws from.
+        batch_size: observations per gradient; all of them where there are fewer.
+    """
+
+    step_size: float = 0.01
+    decay: float = 0.05
+    learning_rate: float = 0.01
+    window_size: int = 100
+    batch_size: int = 256
+
+
+class Data(NamedTuple):
+    """Standardised inputs and targets, float64."""
+
+    x: Float[Tensor, "N D"]
+    y: Float[Tensor, "N T"]
+
+    def minibatch(self, size: int, generator: torch.Generator) -> "Data":
+        """``size`` rows drawn uniformly with replacement; everything if there are no more than that."""
+        if self.x.shape[0] <= size:
+            return self
+        rows = torch.randint(self.x.shape[0], (size,), generator=generator, device=self.x.device)
+        return Data(self.x[rows], self.y[rows])
+
+
+class Trained(NamedTuple):
+    """The outcome of `train`: hyperparameters, the chain at its last position, and the last negative log joint."""
+
+    model: DeepGP
+    chain: SGHMCState
+    negative_log_joint: float
+
+
+def negative_log_joint(
+    kernel: Kernel,
+    model: DeepGP,
+    factors: list[Tensor],
+    whitened: Float[Tensor, "V"],
+    batch: Data,
+    num_data: int,
+    generator: torch.Generator,
+) -> Float[Tensor, ""]:
+    """-log p(y, v) / N, unbiased by a minibatch: -mean log p(y | v) + |v|^2 / (2 N)."""
+    mean, variance = propagate(kernel, model, factors, model.split(whitened), batch.x, generator)
+    likelihood = log_likelihood(model, mean, variance, batch.y).mean()
+    return -likelihood + 0.5 * whitened.square().sum() / num_data
+
+
+def _gradient(
+    kernel: Kernel, model: DeepGP, factors: list[Tensor], chain: SGHMCState, batch: Data, num_data: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """The negative log joint at the chain's position and its gradient there, hyperparameters held fixed."""
+    position = chain.position.detach().requires_grad_()
+    value = negative_log_joint(kernel, model, factors, position, batch, num_data, generator)
+    (gradient,) = torch.autograd.grad(value, position)
+    return value.detach(), gradient
+
+
+def train(
+    kernel: Kernel,
+    model: DeepGP,
+    chain: SGHMCState,
+    data: Data,
+    num_iterations: int,
+    generator: torch.Generator,
+    settings: InferenceSettings,
+    progress: Callable[[int, Tensor], None] | None = None,
+) -> Trained:
+    """Alternate SG-HMC steps (burn-in, preconditioner adapting) and Adam steps ``num_iterations`` times.
+
+    Args:
+        chain: where to start; its preconditioner is kept.
+        progress: called with the iteration and the negative log joint (a tensor, not synchronised).
+    """
+    num_data = data.x.shape[0]
+    parameters = [p.detach().clone().requires_grad_() for p in model.parameters()]
+    live = _rebuild(model, parameters)
+    optimiser = torch.optim.Adam(parameters, lr=settings.learning_rate)
+    window = chain.position.new_empty(settings.window_size, chain.position.numel())
+    value = chain.position.new_zeros(())
+    for iteration in range(num_iterations):
+        batch = data.minibatch(settings.batch_size, generator)
+        factors = factorise_all(kernel, live)
+
+        # E-step: move the inducing outputs under the current hyperparameters.
+        value, gradient = _gradient(
+            kernel, live.detach(), [f.detach() for f in factors], chain, batch, num_data, generator
+        )
+        chain = sghmc.step(
+            chain, gradient, num_data, generator, step_size=settings.step_size, decay=settings.decay, burn_in=True
+        )
+        window[iteration % settings.window_size] = chain.position
+
+        # M-step: move the hyperparameters under a sample from the window.
+        held = min(iteration + 1, settings.window_size)
+        pick = int(torch.randint(held, (), generator=generator, device=generator.device))
+        optimiser.zero_grad()
+        negative_log_joint(kernel, live, factors, window[pick], batch, num_data, generator).backward()
+        optimiser.step()
+        if progress is not None:
+            progress(iteration, value)
+    return Trained(live.detach(), chain, float(value))
+
+
+def sample(
+    kernel: Kernel,
+    model: DeepGP,
+    chain: SGHMCState,
+    data: Data,
+    num_samples: int,
+    spacing: int,
+    generator: torch.Generator,
+    settings: InferenceSettings,
+    factors: list[Tensor] | None = None,
+) -> Iterator[SGHMCState]:
+    """Run the chain with frozen hyperparameters and preconditioner; yield it every ``spacing`` steps.
+
+    Args:
+        factors: L_z of every layer, if the caller has them already.
+    """
+    num_data = data.x.shape[0]
+    model = model.detach()
+    factors = factorise_all(kernel, model) if factors is None else factors
+    for _ in range(num_samples):
+        for _ in range(spacing):
+            batch = data.minibatch(settings.batch_size, generator)
+            _, gradient = _gradient(kernel, model, factors, chain, batch, num_data, generator)
+            chain = sghmc.step(
+                chain, gradient, num_data, generator, step_size=settings.step_size, decay=settings.decay, burn_in=False
+            )
+        yield chain
+
+
+def _rebuild(model: DeepGP, parameters: list[Tensor]) -> DeepGP:
+    """``model`` with its tensors replaced, in the order of `DeepGP.parameters`."""
+    layers = tuple(
+        type(layer)(*parameters[3 * i : 3 * i + 3]) for i, layer in enumerate(model.layers)
+    )
+    return DeepGP(layers, parameters[-1])
