@@ -1,0 +1,6 @@
+"""The agents: model-predictive control as Stable-Baselines3 algorithms, and the named methods made of its parts."""
+
+from gym_dgpmpc.agents.dgp_mpc import DGPMPCAgent
+from gym_dgpmpc.agents.mpc import MPCAgent
+
+__all__ = ["DGPMPCAgent", "MPCAgent"]

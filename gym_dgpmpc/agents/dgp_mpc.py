@@ -1,0 +1,170 @@
+"""DGP-MPC: a deep Gaussian process for the dynamics, the cross-entropy method for the plan.
+
+Gadd et al. (2020), "Sample-Efficient Reinforcement Learning using Deep Gaussian Processes".
+"""
+
+from typing import ClassVar
+
+import torch
+from stable_baselines3.common.type_aliases import GymEnv
+
+from gym_dgpmpc.agents.mpc import MPCAgent
+from gym_dgpmpc.agents.task import find_observation_spec, flat_size
+from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.dynamics.deep_gp_draws import Draw, Refresh
+from gym_dgpmpc.planning.cem import CEM
+from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
+
+
+class DGPMPCAgent(MPCAgent):
+    """The paper's agent, an `MPCAgent` made of a `DeepGPDynamics` and a `CEM`.
+
+        agent = DGPMPCAgent("ModCartPole-v0", seed=0, verbose=1)
+        agent.learn(total_timesteps=2_000)
+
+    The paper's settings of a task are in `presets.PAPER`: ``DGPMPCAgent(env, **PAPER["ModCartPole-v0"])``.
+
+    Args:
+        env: the environment, its id, or a VecEnv of one environment; actions a bounded Box, observations a vector.
+        num_layers: L, layers of the deep GP.
+        kernel: of every layer: "rbf", "matern52", "matern32" or "matern12".
+        num_inducing: M, inducing points per layer.
+        draw: how a world is drawn from the posterior: "pathwise" (functions), "joint" (values, jointly across the
+            candidate sequences, as in the paper) or "marginal" (values, independently).
+        refresh: for "pathwise": a new function per particle at each "step" of a plan, or one for the whole "plan".
+        num_features: F, random features of a pathwise draw.
+        first_training_iterations: iterations (one SG-HMC and one Adam step each) of the first training.
+        training_iterations: iterations of each later one.
+        num_samples: posterior samples kept; the particles of a plan are drawn from them.
+        sample_spacing: SG-HMC steps between two kept samples.
+        resample_steps: SG-HMC steps after each control step; 0 keeps the posterior as it is within an episode.
+        num_particles: P, worlds drawn for each plan.
+        horizon: H, steps that a plan looks ahead.
+        num_candidates: K, action sequences tried in each iteration of the planner.
+        num_elites: the best of them, that the next iteration starts from; default: a tenth.
+        num_iterations: the most iterations of a plan.
+        actions_per_plan: actions performed of each plan before the next one is made.
+        learning_starts: environment steps of uniform random actions; default: those of one episode.
+        reward_fn: r(s, a, s'), batched over leading dimensions, in torch; default: the environment's ``reward_fn``.
+        terminated_fn: whether an episode ends in s', batched likewise; default: the environment's ``terminated_fn``.
+        observation_spec: how the model reads observations; default: the environment's ``observation_spec``.
+        stats_window_size: episodes that the logged means are over.
+        tensorboard_log: folder for TensorBoard, or None.
+        verbose: 0 for silence, 1 for one line per episode, 2 for SB3's tables of logged values besides.
+        seed: decides everything random: environment, exploration, training and planning. None draws one, kept in
+            ``agent.seed``, and leaves the environment's own seed alone.
+        device: "cpu", "cuda", or "auto" for the second where there is one.
+
+    Raises:
+        ValueError: an argument is out of its range, or the environment is one that cannot be planned for.
+        AssertionError: the action space is not a Box, as from every SB3 algorithm.
+        UnknownRewardError: there is no reward function.
+    """
+
+    saved_arguments: ClassVar[tuple[str, ...]] = (
+        *MPCAgent.saved_arguments,
+        "num_layers",
+        "kernel",
+        "num_inducing",
+        "draw",
+        "refresh",
+        "num_features",
+        "first_training_iterations",
+        "training_iterations",
+        "num_samples",
+        "sample_spacing",
+        "resample_steps",
+        "horizon",
+        "num_candidates",
+        "num_elites",
+        "num_iterations",
+        "observation_spec",
+    )
+
+    def __init__(
+        self,
+        env: GymEnv | str | None,
+        *,
+        num_layers: int = 2,
+        kernel: str = "matern32",
+        num_inducing: int = 200,
+        draw: Draw = "pathwise",
+        refresh: Refresh = "step",
+        num_features: int = 256,
+        first_training_iterations: int = 4000,
+        training_iterations: int = 1000,
+        num_samples: int = 100,
+        sample_spacing: int = 10,
+        resample_steps: int = 5,
+        num_particles: int = 5,
+        horizon: int = 30,
+        num_candidates: int = 300,
+        num_elites: int | None = None,
+        num_iterations: int = 5,
+        actions_per_plan: int = 1,
+        learning_starts: int | None = None,
+        reward_fn: RewardFn | None = None,
+        terminated_fn: TerminatedFn | None = None,
+        observation_spec: ObservationSpec | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: torch.device | str = "cpu",
+        _init_setup_model: bool = True,
+    ):
+        self.num_layers, self.kernel, self.num_inducing = num_layers, kernel, num_inducing
+        self.draw, self.refresh, self.num_features = draw, refresh, num_features
+        self.first_training_iterations, self.training_iterations = first_training_iterations, training_iterations
+        self.num_samples, self.sample_spacing, self.resample_steps = num_samples, sample_spacing, resample_steps
+        self.horizon, self.num_candidates = horizon, num_candidates
+        self.num_elites, self.num_iterations = num_elites, num_iterations
+        self.observation_spec = observation_spec
+        super().__init__(
+            env,
+            reward_fn=reward_fn,
+            terminated_fn=terminated_fn,
+            num_particles=num_particles,
+            actions_per_plan=actions_per_plan,
+            learning_starts=learning_starts,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=_init_setup_model,
+        )
+
+    def _setup_model(self) -> None:
+        """Build the parts for the environment's spaces."""
+        self.observation_spec = find_observation_spec(self.env, self.observation_spec)
+        low, high = (
+            torch.as_tensor(bound, dtype=torch.float32, device=self.device).flatten()
+            for bound in (self.action_space.low, self.action_space.high)
+        )
+        self.planner = CEM(
+            action_low=low,
+            action_high=high,
+            horizon=self.horizon,
+            num_candidates=self.num_candidates,
+            num_elites=max(1, self.num_candidates // 10) if self.num_elites is None else self.num_elites,
+            num_iterations=self.num_iterations,
+        )
+        self.dynamics = DeepGPDynamics(
+            flat_size(self.observation_space),
+            flat_size(self.action_space),
+            self.observation_spec,
+            num_layers=self.num_layers,
+            kernel=self.kernel,
+            num_inducing=self.num_inducing,
+            draw=self.draw,
+            refresh=self.refresh,
+            num_features=self.num_features,
+            first_iterations=self.first_training_iterations,
+            iterations=self.training_iterations,
+            num_samples=self.num_samples,
+            sample_spacing=self.sample_spacing,
+            resample_steps=self.resample_steps,
+            device=self.device,
+        )
+        super()._setup_model()

@@ -1,0 +1,222 @@
+"""Model-predictive control with any dynamics model and any planner, as a Stable-Baselines3 algorithm.
+
+Learning is Algorithm 2 of Gadd et al. (2020), "Sample-Efficient Reinforcement Learning using Deep Gaussian
+Processes"; it stands in one function, `MPCAgent._control`.
+"""
+
+import time
+from typing import Any, TypeVar
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
+
+from gym_dgpmpc.agents.base import PlanningAgent
+from gym_dgpmpc.agents.episode import EpisodeRecord
+from gym_dgpmpc.errors import EnvironmentDataError
+
+SelfAgent = TypeVar("SelfAgent", bound="MPCAgent")
+
+
+class MPCAgent(PlanningAgent):
+    """Learns a dynamics model from its own experience and acts by planning through it.
+
+    The first steps are uniformly random. From then on the model is trained at each episode's start, and every action
+    comes from a plan: P worlds are drawn from the model, and the planner searches the H actions with the highest
+    return, averaged over the worlds.
+
+    `predict` carries the plan in SB3's recurrent state, as a warm start for the next step: pass on the state that it
+    returns (`evaluate_policy` does). Without it every step is planned from scratch, which costs return.
+
+    Args:
+        env: the environment, its id, or a VecEnv of one environment; actions a bounded Box, observations a vector.
+        dynamics: the model to learn.
+        planner: the optimiser of action sequences; its horizon is the plan's.
+        reward_fn: r(s, a, s'), batched over leading dimensions, in torch; default: the environment's ``reward_fn``.
+        terminated_fn: whether an episode ends in s', batched likewise; default: the environment's ``terminated_fn``,
+            and if it has none, the planner takes episodes not to end.
+        num_particles: P, worlds drawn for each plan.
+        actions_per_plan: actions performed of each plan before the next one is made.
+        learning_starts: environment steps of uniform random actions; default: those of one episode.
+        stats_window_size: episodes that the logged means are over.
+        tensorboard_log: folder for TensorBoard, or None.
+        verbose: 0 for silence, 1 for one line per episode, 2 for SB3's tables of logged values besides.
+        seed: decides everything random: environment, exploration, training and planning. None draws one, kept in
+            ``agent.seed``, and leaves the environment's own seed alone.
+        device: where planning computes ("cpu", "cuda", or "auto"); dynamics and planner must live there too.
+
+    Raises:
+        ValueError: an argument is out of its range, or the environment is one that cannot be planned for.
+        AssertionError: the action space is not a Box, as from every SB3 algorithm.
+        UnknownRewardError: there is no reward function.
+    """
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._carried = self.planning.cold  # the running episode's plan
+        self._record = EpisodeRecord(1, self.planning.horizon)
+        self._episode_index = 0  # of the running episode in the store
+        self._explored_episode = False  # whether an episode of random actions has ended
+
+    @property
+    def is_exploring(self) -> bool:
+        """Whether the next action is random because there are too few transitions to learn from."""
+        if self.is_fitted:
+            return False
+        return not self._explored_episode if self.learning_starts is None else len(self.store) < self.learning_starts
+
+    def learn(
+        self: SelfAgent,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "MPC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfAgent:
+        """Act, record and train for ``total_timesteps`` environment steps, the random ones included.
+
+        May be called again: data and model persist, and random actions are not repeated. With
+        ``reset_num_timesteps=False`` counting, logs and a running episode go on where they were. Training belongs to
+        an episode's start; it is also done when the last step ends an episode, so that the agent one gets has seen
+        every finished episode.
+
+        Whatever goes wrong, the transitions observed so far stay in ``agent.store``, and `learn` can be called again.
+
+        Args:
+            total_timesteps: environment steps of this call.
+            callback: SB3 callback(s), called after each step.
+            log_interval: episodes between two writings of the log.
+            tb_log_name: name of the run's folder under ``tensorboard_log``.
+            reset_num_timesteps: start counting from zero, with a new episode.
+            progress_bar: show one.
+
+        Raises:
+            EnvironmentDataError: the environment returned something that is not finite.
+            PlanningError: no candidate plan had a finite return.
+        """
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        callback.on_training_start(locals(), globals())
+        self._control(total_timesteps, callback, log_interval)
+        callback.on_training_end()
+        return self
+
+    def _control(self, total_timesteps: int, callback: BaseCallback, log_interval: int) -> None:
+        """Algorithm 2 of the paper, one pass through the loop per control step."""
+        while self.num_timesteps < total_timesteps:
+            # For each episode: train the model, that is, optimise {Z, theta, beta} and sample U.
+            if self._last_episode_starts[0]:
+                self._begin_episode(callback)
+            self._fit_if_due()
+
+            # Sample K action sequences and P trajectories of each, update m and v by their returns, repeat.
+            observation = self._last_obs[0]
+            if self.is_exploring:
+                action = self.planning.uniform(self.generators.exploration)
+            else:
+                action = self._plan(observation)
+
+            # Perform the first action of the sequence, append the observed tuple to the data set.
+            rewards, dones, infos = self._perform_and_append(observation, action)
+
+            # Re-sample the inducing outputs U.
+            if self.is_fitted:
+                self.dynamics.resample(self.store.transitions(), self.generators.fit)
+
+            if dones[0]:
+                self._end_episode(infos, dones, callback, log_interval)
+            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return
+        self._fit_if_due()
+
+    def _begin_episode(self, callback: BaseCallback) -> None:
+        """A new episode starts with a cold plan."""
+        if not np.all(np.isfinite(self._last_obs)):
+            received, self._last_obs = self._last_obs[0], None
+            raise EnvironmentDataError(
+                f"after {self.num_timesteps} steps: the environment's reset returned an observation that is not "
+                f"finite: {received}"
+            )
+        self._carried = self.planning.cold
+        self._record = EpisodeRecord(self._episode_num + 1, self.planning.horizon)
+        self._episode_index = int(self.store.episodes[-1]) + 1 if len(self.store) else 0
+        callback.on_rollout_start()
+
+    def _fit_if_due(self) -> None:
+        """Train if an episode ended, or exploration did, and there is something new to learn from."""
+        due = not self.is_exploring and (self._last_episode_starts[0] or not self.is_fitted)
+        if not due or len(self.store) == self.num_fitted:
+            return
+        started = time.perf_counter()
+        metrics = dict(self.dynamics.fit(self.store.transitions(), self.generators.fit))
+        self.num_fitted = len(self.store)
+        metrics |= {"num_transitions": self.num_fitted, "seconds": time.perf_counter() - started}
+        for name, value in metrics.items():
+            self.logger.record(f"train/{name}", value)
+
+    def _plan(self, observation: np.ndarray) -> np.ndarray:
+        """The next action [A] of the running episode's plan, which is made anew when it is used up."""
+        started = time.perf_counter()
+        action, self._carried, info = self.planning.plan(
+            self.task, observation, self._carried, self.generators.planning
+        )
+        if info is not None:
+            self._record.add_plan(info, time.perf_counter() - started)
+        return action
+
+    def _perform_and_append(
+        self, observation: np.ndarray, action: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Step the environment and store what it did; a step counts only once it is stored."""
+        # Until then there is no observation to go on from: after an error, learn begins a new episode.
+        self._last_obs = None
+        new_obs, rewards, dones, infos = self.env.step(action.reshape(1, *self.action_space.shape))
+        # At an episode's end the environment has been reset already, and the true next observation is set aside.
+        next_observation = infos[0]["terminal_observation"] if dones[0] else new_obs[0]
+        terminated = bool(dones[0]) and not infos[0].get("TimeLimit.truncated", False)
+        if self._vec_normalize_env is not None:
+            rewards = self._vec_normalize_env.get_original_reward()
+        self.store.append(
+            observation,
+            action,
+            next_observation,
+            reward=float(rewards[0]),
+            terminated=terminated,
+            episode=self._episode_index,
+        )
+        self.num_timesteps += 1
+        self._record.add_reward(float(rewards[0]))
+        self._last_obs, self._last_episode_starts = new_obs, dones
+        if terminated and self.task.terminated_fn is None:
+            self._warn_once(
+                "the environment ended an episode by termination, which the planner knows nothing of: pass "
+                "terminated_fn=..., or give the environment an attribute of that name"
+            )
+        return rewards, dones, infos
+
+    def _end_episode(
+        self, infos: list[dict[str, Any]], dones: np.ndarray, callback: BaseCallback, log_interval: int
+    ) -> None:
+        """Count, log and print what happened."""
+        self._explored_episode = True
+        self._episode_num += 1
+        self._update_info_buffer(infos, dones)
+        if self.verbose >= 1:
+            print(self._record.line(self.num_timesteps), flush=True)
+        for name, value in self._record.metrics().items():
+            self.logger.record(name, value)
+        if log_interval is not None and self._episode_num % log_interval == 0:
+            self.dump_logs()
+        callback.on_rollout_end()
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        # SB3 prints its tables at verbose=1; here that level is one line per episode.
+        verbose, self.verbose = self.verbose, max(self.verbose - 1, 0)
+        try:
+            return super()._setup_learn(*args, **kwargs)
+        finally:
+            self.verbose = verbose

@@ -1,0 +1,96 @@
+"""From an observation to an action: draw worlds from the model, plan in them, carry the plan on.
+
+Knows nothing of learning or of the environment; the agent asks it both while it learns and when it predicts.
+"""
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from gym_dgpmpc.agents.plan_state import PlanState
+from gym_dgpmpc.agents.task import Task
+from gym_dgpmpc.errors import PlanningError
+from gym_dgpmpc.planning.rollout import rollout_objective
+from gym_dgpmpc.types import DynamicsModel, PlanInfo, Planner
+
+
+class PlanningPolicy:
+    """Acts by planning through a dynamics model.
+
+    Args:
+        dynamics: the model that worlds are drawn from.
+        planner: optimises action sequences; its horizon is the plan's.
+        action_space: bounds of the actions.
+        num_particles: P, worlds per plan.
+        actions_per_plan: actions performed of each plan before the next one is made.
+        device: where dynamics and planner compute.
+
+    Raises:
+        ValueError: a number is out of its range.
+    """
+
+    def __init__(
+        self,
+        dynamics: DynamicsModel,
+        planner: Planner,
+        action_space: spaces.Box,
+        num_particles: int,
+        actions_per_plan: int,
+        device: torch.device,
+    ):
+        self.dynamics, self.planner = dynamics, planner
+        self.num_particles, self.actions_per_plan, self.device = num_particles, actions_per_plan, device
+        self.cold = PlanState(planner.initial_plan())
+        """Where the first plan of an episode starts from."""
+        self.horizon = self.cold.plan.mean.shape[0]
+        if num_particles < 1:
+            raise ValueError(f"num_particles must be at least 1, got {num_particles}")
+        if not 1 <= actions_per_plan <= self.horizon:
+            raise ValueError(
+                f"actions_per_plan must lie in 1 to the planner's horizon {self.horizon}, got {actions_per_plan}"
+            )
+        self._low, self._high = (
+            torch.as_tensor(bound, dtype=torch.float32, device=device).flatten()
+            for bound in (action_space.low, action_space.high)
+        )
+
+    @torch.no_grad()
+    def plan(
+        self, task: Task, observation: np.ndarray, state: PlanState, generator: torch.Generator
+    ) -> tuple[np.ndarray, PlanState, PlanInfo | None]:
+        """One action from the carried plan; if none of its actions are left, optimise it first.
+
+        Args:
+            task: the reward and termination to plan with.
+            observation: [S].
+            state: what the last step of the same episode returned, or `cold`.
+            generator: for the worlds and the planner.
+
+        Returns:
+            The action [A], the state to carry to the next step, and what the planner found (None if no plan was made).
+
+        Raises:
+            PlanningError: no candidate had a finite return.
+        """
+        plan, age, info = *state, None
+        if age == 0:
+            worlds = self.dynamics.draw(self.num_particles, self.horizon, generator)
+            start = torch.as_tensor(observation, dtype=torch.float32, device=self.device)
+            objective = rollout_objective(worlds, task.reward_fn, start, self.num_particles, task.terminated_fn)
+            try:
+                plan, info = self.planner.plan(objective, plan, generator)
+            except PlanningError as error:
+                raise PlanningError(f"{error}; planning started from the observation {observation}") from error
+        action = plan.mean[age].clamp(self._low, self._high).cpu().numpy()
+        age += 1
+        carried = PlanState(plan, age) if age < self.actions_per_plan else PlanState(self.planner.shift(plan, age))
+        return action, carried, info
+
+    def midpoint(self) -> np.ndarray:
+        """The middle of the action range, [A]."""
+        return (self._low / 2 + self._high / 2).cpu().numpy()
+
+    def uniform(self, generator: torch.Generator) -> np.ndarray:
+        """A uniformly random action, [A]."""
+        uniform = torch.rand(self._low.shape, generator=generator, device=self.device)
+        return (self._low + (self._high - self._low) * uniform).cpu().numpy()

@@ -1,0 +1,189 @@
+"""What an agent's file holds, and how an agent is made from it again.
+
+Saved: the constructor's plain arguments, the spaces, everything learned (all kept posterior samples, normaliser,
+data), counters, the state of every generator and the running plan. Not saved: a reward or termination function (the
+environment offers it, or `load` is given it again), the environment, and of a plain `MPCAgent` the objects it was
+composed of.
+"""
+
+import importlib.metadata
+from collections import deque
+from dataclasses import asdict
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from gym_dgpmpc.agents.checkpoint import Checkpoint
+from gym_dgpmpc.agents.plan_state import pack, unpack
+from gym_dgpmpc.agents.randomness import derive_seed
+from gym_dgpmpc.agents.task import offered_by
+from gym_dgpmpc.errors import CheckpointError
+from gym_dgpmpc.types import ObservationSpec, StateDict
+
+AGENT_CLASSES = {"MPCAgent": "gym_dgpmpc.agents.mpc", "DGPMPCAgent": "gym_dgpmpc.agents.dgp_mpc"}
+"""The classes that a file may name, and where they are; nothing else is ever imported for a file."""
+
+PACKAGES = ("gym_dgpmpc", "gymnasium", "numpy", "stable_baselines3", "torch")
+COUNTERS = ("num_timesteps", "num_fitted", "_episode_num", "_episode_index", "_explored_episode")
+
+
+def collect(agent: Any) -> Checkpoint:
+    """Everything of an `MPCAgent` that goes into its file."""
+    boxes = {"observation_space": agent.observation_space, "action_space": agent.action_space}
+    bounds = {f"{name}.low": torch.tensor(box.low) for name, box in boxes.items()}
+    bounds |= {f"{name}.high": torch.tensor(box.high) for name, box in boxes.items()}
+    plan = dict(zip(("plan.mean", "plan.std", "plan.age"), map(torch.from_numpy, pack([agent._carried])), strict=True))
+    tensors = {
+        "dynamics": agent.dynamics.state_dict(),
+        "transitions": agent.store.state_dict(),
+        "generators": agent.generators.state_dict(),
+        "agent": bounds | plan,
+    }
+    if agent._last_obs is not None:
+        tensors["agent"] |= {
+            "last_observation": torch.tensor(agent._last_obs),
+            "last_episode_starts": torch.tensor(agent._last_episode_starts),
+        }
+    spec = offered_by(agent.env, "spec")
+    config = {
+        "class": type(agent).__name__,
+        "arguments": {name: _encode(getattr(agent, name)) for name in agent.saved_arguments},
+        "seeds_environment": agent.seeds_environment,
+        "environment": None if spec is None else spec.id,
+        "space_dtypes": {name: str(box.dtype) for name, box in boxes.items()},
+        "counters": {name: getattr(agent, name) for name in COUNTERS},
+        "episode_infos": [_plain(info) for info in agent.ep_info_buffer or ()],
+        "episode_successes": [float(success) for success in agent.ep_success_buffer or ()],
+        "values": {part: _without_tensors(state) for part, state in tensors.items()},
+        "versions": {name: _version(name) for name in PACKAGES},
+    }
+    return Checkpoint(config, {part: _only_tensors(state) for part, state in tensors.items()})
+
+
+def class_of(checkpoint: Checkpoint, asked: type) -> type:
+    """The class that a file names: one of the package's, or the very class that was asked to load it.
+
+    Raises:
+        CheckpointError: it is another class, or not a subclass of the one asked.
+    """
+    name = checkpoint.config.get("class")
+    if name == asked.__name__:
+        return asked
+    if not isinstance(name, str) or name not in AGENT_CLASSES:
+        raise CheckpointError(f"the file holds an agent of the class {name!r}, not of {', '.join(AGENT_CLASSES)}")
+    found = getattr(import_module(AGENT_CLASSES[name]), name)
+    if not issubclass(found, asked):
+        raise CheckpointError(f"the file holds a {name}: load it with {name}.load, not {asked.__name__}.load")
+    return found
+
+
+def saved_arguments(checkpoint: Checkpoint, agent_class: Any) -> dict[str, Any]:
+    """The constructor arguments in a file, decoded.
+
+    Raises:
+        CheckpointError: they are not those of the class.
+    """
+    arguments = checkpoint.config.get("arguments")
+    if not isinstance(arguments, dict) or set(arguments) != set(agent_class.saved_arguments):
+        received = sorted(arguments) if isinstance(arguments, dict) else arguments
+        raise CheckpointError(
+            f"the file's arguments are not those of {agent_class.__name__}: expected "
+            f"{sorted(agent_class.saved_arguments)}, got {received}"
+        )
+    return {name: _decode(value) for name, value in arguments.items()}
+
+
+def saved_spaces(checkpoint: Checkpoint) -> tuple[spaces.Box, spaces.Box]:
+    """Observation and action space of the saved agent.
+
+    Raises:
+        CheckpointError: the file does not describe two boxes.
+    """
+    try:
+        return tuple(  # type: ignore[return-value]
+            spaces.Box(
+                checkpoint.tensors["agent"][f"{name}.low"].numpy(),
+                checkpoint.tensors["agent"][f"{name}.high"].numpy(),
+                dtype=np.dtype(checkpoint.config["space_dtypes"][name]).type,
+            )
+            for name in ("observation_space", "action_space")
+        )
+    except Exception as error:
+        raise CheckpointError(f"the file does not describe the spaces of its agent: {error!r}") from error
+
+
+def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True, force_reset: bool = True) -> None:
+    """Put a file's contents into a freshly constructed agent of the same arguments.
+
+    Args:
+        agent: the agent.
+        checkpoint: what `collect` returned for another.
+        keep_generators: continue the saved random streams; otherwise those of the agent's own seed begin.
+        force_reset: begin a new episode when learning goes on, instead of the one that was running.
+
+    Raises:
+        CheckpointError: something is missing or does not fit the agent.
+    """
+    config, parts = checkpoint
+    try:
+        state = {part: {**tensors, **config["values"].get(part, {})} for part, tensors in parts.items()}
+        agent.dynamics.load_state_dict(state["dynamics"])
+        agent.store.load_state_dict(state["transitions"])
+        if keep_generators:
+            agent.generators.load_state_dict(state["generators"])
+        agent.seeds_environment = bool(config["seeds_environment"])
+        for name in COUNTERS:
+            setattr(agent, name, type(getattr(agent, name))(config["counters"][name]))
+        agent.ep_info_buffer = deque(config["episode_infos"], maxlen=agent.stats_window_size)
+        agent.ep_success_buffer = deque(config["episode_successes"], maxlen=agent.stats_window_size)
+        own = state["agent"]
+        carried = tuple(own[name].numpy() for name in ("plan.mean", "plan.std", "plan.age"))
+        (agent._carried,) = unpack(carried, agent.planning.cold, 1, agent.actions_per_plan)
+        if not force_reset and "last_observation" in own:
+            agent._last_obs = own["last_observation"].numpy()
+            agent._last_episode_starts = own["last_episode_starts"].numpy()
+    except CheckpointError:
+        raise
+    except Exception as error:
+        raise CheckpointError(f"the file does not fit a {type(agent).__name__} of its arguments: {error!r}") from error
+    if agent.env is not None and agent.seeds_environment and force_reset:
+        # Not the seed itself: an environment that is seeded with it again repeats the episodes of the first run.
+        agent.env.seed(derive_seed(agent.seed, "environment", agent.num_timesteps))
+
+
+def _encode(value: Any) -> Any:
+    return {"observation_spec": asdict(value)} if isinstance(value, ObservationSpec) else value
+
+
+def _decode(value: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    try:
+        fields = value["observation_spec"].items()
+        return ObservationSpec(**{name: tuple(map(int, indices)) for name, indices in fields})
+    except Exception as error:
+        raise CheckpointError(f"the file holds an argument that cannot be read: {value}") from error
+
+
+def _only_tensors(state: StateDict) -> dict[str, Tensor]:
+    return {name: value for name, value in state.items() if isinstance(value, Tensor)}
+
+
+def _without_tensors(state: StateDict) -> dict[str, int | float | str]:
+    return {name: value for name, value in state.items() if not isinstance(value, Tensor)}
+
+
+def _plain(info: dict[str, Any]) -> dict[str, float]:
+    """Monitor's summary of an episode; what else users put into it may not be a number and is left out."""
+    return {name: float(value) for name, value in info.items() if isinstance(value, int | float | np.number)}
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package.replace("_", "-"))
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
