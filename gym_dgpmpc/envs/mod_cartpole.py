@@ -1,6 +1,7 @@
 """The cart-pole with continuous force: the modified task beside the rail's end, and the plain swing-up."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from operator import index
@@ -12,7 +13,7 @@ import torch
 from gymnasium import spaces, utils
 from gymnasium.envs.mujoco import MujocoEnv
 from jaxtyping import Float
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gym_dgpmpc.types import ObservationSpec
@@ -90,7 +91,7 @@ class ModCartPoleEnv(MujocoEnv, utils.EzPickle):
     the rail the cart's centre reaches 2.65 m.
 
     ## Action space
-    `Box(-3, 3, (1,), float32)`. Actions outside the bounds are clipped, before the dynamics and before the reward.
+    `Box(-3.0, 3.0, (1,), float32)`. Actions outside the bounds are clipped, before the dynamics and before the reward.
 
     | Num | Action                                 | Min | Max | Joint (name in the model) | Unit         |
     |-----|----------------------------------------|-----|-----|---------------------------|--------------|
@@ -106,7 +107,7 @@ class ModCartPoleEnv(MujocoEnv, utils.EzPickle):
     | 2   | Velocity of the cart                                  | -inf | inf | slide (slider)            | m/s   |
     | 3   | Angular velocity of the pole                          | -inf | inf | hinge (hinge)             | rad/s |
 
-    The soft limit of the rail keeps the position between about -2.65 and 2.65.
+    The soft limit of the rail keeps the position between about -2.8 and 2.8.
 
     ## Reward
     The reward of a step is *closeness - control_cost*, evaluated on the state that the step leads to:
@@ -128,17 +129,17 @@ class ModCartPoleEnv(MujocoEnv, utils.EzPickle):
 
     ## Arguments
 
-    | Parameter           | Type                | Default      | Description                                              |
-    |---------------------|---------------------|--------------|----------------------------------------------------------|
-    | `start_position`    | float               | `2.4`        | Mean start position of the cart, m, in [-2.5, 2.5]       |
-    | `target`            | two floats          | `(2.0, 0.6)` | Target (x, z) of the pole's tip, m                       |
-    | `reset_noise_scale` | float               | `0.1`        | Standard deviation of the starting state                 |
-    | `reward_scale`      | float               | `0.6`        | Distance at which *closeness* is 1/e, m                  |
-    | `ctrl_cost_weight`  | float               | `0.01`       | Weight of the squared action                             |
-    | `frame_skip`        | int                 | `2`          | Simulator steps of 0.02 s in one environment step        |
-    | `render_mode`       | str or None         | `None`       | One of `metadata["render_modes"]`, or None               |
-    | `width`             | int                 | `720`        | Width of rendered images, pixels                         |
-    | `height`            | int                 | `240`        | Height of rendered images, pixels                        |
+    | Parameter           | Type                | Default      | Description                                           |
+    |---------------------|---------------------|--------------|-------------------------------------------------------|
+    | `start_position`    | float               | `2.4`        | Mean start position of the cart, m, in [-2.5, 2.5]    |
+    | `target`            | two floats          | `(2.0, 0.6)` | Target (x, z) of the pole's tip, m                    |
+    | `reset_noise_scale` | float               | `0.1`        | Standard deviation of the starting state              |
+    | `reward_scale`      | float               | `0.6`        | Distance at which *closeness* is 1/e, m               |
+    | `ctrl_cost_weight`  | float               | `0.01`       | Weight of the squared action                          |
+    | `frame_skip`        | int                 | `2`          | Simulator steps of 0.02 s in one environment step     |
+    | `render_mode`       | str or None         | `None`       | One of `metadata["render_modes"]`, or None            |
+    | `width`             | int                 | `720`        | Width of rendered images, pixels                      |
+    | `height`            | int                 | `240`        | Height of rendered images, pixels                     |
 
     ## Version history
     * v0: first version.
@@ -149,7 +150,7 @@ class ModCartPoleEnv(MujocoEnv, utils.EzPickle):
     def __init__(
         self,
         start_position: float = 2.4,
-        target: ArrayLike = (2.0, 0.6),
+        target: Sequence[float] | NDArray[Any] = (2.0, 0.6),
         reset_noise_scale: float = 0.1,
         reward_scale: float = 0.6,
         ctrl_cost_weight: float = 0.01,
@@ -211,7 +212,7 @@ class ModCartPoleEnv(MujocoEnv, utils.EzPickle):
         return ObservationSpec(angles=(1,))
 
     def step(  # type: ignore[override]  # a plain float as reward, as Gymnasium's Env says
-        self, action: ArrayLike
+        self, action: NDArray[Any]
     ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, float]]:
         """Apply the action, shape (1,) in units of 100 N, for ``frame_skip`` simulator steps."""
         action = np.asarray(action)
@@ -243,7 +244,23 @@ class ModCartPoleEnv(MujocoEnv, utils.EzPickle):
     def render(self) -> Any:
         """Draw the present state in the way ``render_mode`` says."""
         mujoco.mj_kinematics(self.model, self.data)  # a simulator step leaves the bodies' places one step behind
+        self._make_context_current()
         return super().render()
+
+    def close(self) -> None:
+        """Release what rendering holds; harmless when done before, or when nothing was rendered."""
+        viewer = self._make_context_current()
+        if viewer is not None:  # freed later, with another environment's context current, it would free that one's
+            viewer.con.free()
+        super().close()
+        self.mujoco_renderer.viewer = None
+
+    def _make_context_current(self) -> Any:
+        """Give OpenGL back to this environment's viewer, if there is one: another may have drawn in between."""
+        viewer: Any = self.mujoco_renderer.viewer
+        if viewer is not None:
+            viewer.make_context_current()
+        return viewer
 
     def _get_obs(self) -> NDArray[np.float64]:
         return np.concatenate([self.data.qpos, self.data.qvel])
@@ -268,16 +285,18 @@ class SwingUpCartPoleEnv(ModCartPoleEnv):
     ## Arguments
     Those of `ModCartPole-v0`, with these defaults instead:
 
-    | Parameter           | Type                | Default      | Description                                              |
-    |---------------------|---------------------|--------------|----------------------------------------------------------|
-    | `start_position`    | float               | `0.0`        | Mean start position of the cart, m, in [-2.5, 2.5]       |
-    | `target`            | two floats          | `(0.0, 0.6)` | Target (x, z) of the pole's tip, m                       |
+    | Parameter           | Type                | Default      | Description                                           |
+    |---------------------|---------------------|--------------|-------------------------------------------------------|
+    | `start_position`    | float               | `0.0`        | Mean start position of the cart, m, in [-2.5, 2.5]    |
+    | `target`            | two floats          | `(0.0, 0.6)` | Target (x, z) of the pole's tip, m                    |
 
     ## Version history
     * v0: first version.
     """
 
-    def __init__(self, start_position: float = 0.0, target: ArrayLike = (0.0, 0.6), **kwargs: Any) -> None:
+    def __init__(
+        self, start_position: float = 0.0, target: Sequence[float] | NDArray[Any] = (0.0, 0.6), **kwargs: Any
+    ) -> None:
         super().__init__(start_position, target, **kwargs)
         utils.EzPickle.__init__(self, start_position, target, **kwargs)
 
@@ -302,7 +321,7 @@ def _positive_int(name: str, value: int) -> int:
     return number
 
 
-def _point(name: str, value: ArrayLike) -> tuple[float, float]:
+def _point(name: str, value: Sequence[float] | NDArray[Any]) -> tuple[float, float]:
     coordinates = np.asarray(value, dtype=object)
     if coordinates.shape != (2,):
         raise ValueError(f"{name} must be two finite numbers, x and z in m; got {value!r}")
