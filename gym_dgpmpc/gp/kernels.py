@@ -93,9 +93,14 @@ def correlation(kernel: Kernel, sqdist: Float[Tensor, "*b"]) -> Float[Tensor, "*
 def scaled_sqdist(
     x: Float[Tensor, "*b n D"], z: Float[Tensor, "m D"], lengthscale: Float[Tensor, "D"]
 ) -> Float[Tensor, "*b n m"]:
-    """r^2 between the rows of ``x`` and ``z``; may be negative by rounding."""
+    """r^2 between the rows of ``x`` and ``z``; may be negative by rounding.
+
+    One matrix product of (x, |x|^2, 1) and (-2 z, 1, |z|^2), so that no other operation has the size of the result.
+    """
     x, z = x / lengthscale, z / lengthscale
-    return x.square().sum(-1, keepdim=True) + z.square().sum(-1) - 2.0 * (x @ z.mT)
+    left = torch.cat([x, x.square().sum(-1, keepdim=True), torch.ones_like(x[..., :1])], dim=-1)
+    right = torch.cat([-2.0 * z, torch.ones_like(z[..., :1]), z.square().sum(-1, keepdim=True)], dim=-1)
+    return left @ right.mT
 
 
 def pairwise_sqdist(x: Float[Tensor, "*b n D"]) -> Float[Tensor, "*b n n"]:

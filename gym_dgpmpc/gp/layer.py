@@ -30,20 +30,15 @@ class Layer(NamedTuple):
         return self.log_variance.exp()
 
 
-def covariance(
-    kernel: Kernel, layer: Layer, x: Float[Tensor, "*b n D"], z: Float[Tensor, "m D"]
-) -> Float[Tensor, "*b n m"]:
-    """k(x, z) under the layer's hyperparameters."""
-    return layer.variance * correlation(kernel, scaled_sqdist(x, z, layer.lengthscale))
-
-
 def factorise(kernel: Kernel, layer: Layer) -> Float[Tensor, "M M"]:
     """L_z, the lower Cholesky factor of K_zz + jitter.
 
     Raises:
         FactorisationError: see `linalg.cholesky`.
     """
-    return cholesky(covariance(kernel, layer, layer.inducing_inputs, layer.inducing_inputs), layer.variance)
+    z = layer.inducing_inputs
+    unit = correlation(kernel, scaled_sqdist(z, z, layer.lengthscale))
+    return layer.variance.sqrt() * cholesky(unit, torch.ones_like(layer.log_variance))
 
 
 def conditional(
@@ -58,8 +53,9 @@ def conditional(
     mean = k_xz L_z^-T v, variance = k_xx - |L_z^-1 k_zx|^2, the same for every output.
     """
     projected = _project(kernel, layer, factor, x)
-    variance = layer.variance - projected.square().sum(-2)
-    return projected.mT @ whitened, variance.clamp_min(0.0)
+    # The kernel's variance enters here and not in the large matrix, which training differentiates through.
+    variance = layer.variance * (1.0 - layer.variance * projected.square().sum(-2))
+    return layer.variance * (projected.mT @ whitened), variance.clamp_min(0.0)
 
 
 def joint_conditional(
@@ -71,10 +67,12 @@ def joint_conditional(
 ) -> tuple[Float[Tensor, "*p n O"], Float[Tensor, "*p n n"]]:
     """As `conditional`, with the full covariance of the n points: k_xx' - k_xz K_zz^-1 k_zx'."""
     projected = _project(kernel, layer, factor, x)
-    prior = layer.variance * correlation(kernel, pairwise_sqdist(x / layer.lengthscale))
-    return projected.mT @ whitened, prior - projected.mT @ projected
+    prior = correlation(kernel, pairwise_sqdist(x / layer.lengthscale))
+    covariance = layer.variance * (prior - layer.variance * (projected.mT @ projected))
+    return layer.variance * (projected.mT @ whitened), covariance
 
 
 def _project(kernel: Kernel, layer: Layer, factor: Tensor, x: Tensor) -> Tensor:
-    """L_z^-1 k_zx "*p M n"."""
-    return torch.linalg.solve_triangular(factor, covariance(kernel, layer, x, layer.inducing_inputs).mT, upper=False)
+    """L_z^-1 k_zx / sigma^2 "*p M n"."""
+    unit = correlation(kernel, scaled_sqdist(x, layer.inducing_inputs, layer.lengthscale))
+    return torch.linalg.solve_triangular(factor, unit.mT, upper=False)
