@@ -3,8 +3,6 @@
 Construction and its checks, `predict`, seeds, environments, logs, `save` and `load`. How it learns is in `mpc.py`.
 """
 
-import io
-import pathlib
 import time
 import warnings
 from collections.abc import Iterable
@@ -13,19 +11,19 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_system_info, safe_mean
 
-from gym_dgpmpc.agents.checkpoint import read_checkpoint, write_checkpoint
+from gym_dgpmpc.agents.checkpoint import CheckpointPath, write_checkpoint
 from gym_dgpmpc.agents.plan_state import PolicyState, pack, unpack
 from gym_dgpmpc.agents.policy import PlanningPolicy
 from gym_dgpmpc.agents.randomness import fresh_seed, observation_generator, split_seed
-from gym_dgpmpc.agents.saving import class_of, collect, restore, saved_arguments, saved_spaces
-from gym_dgpmpc.agents.task import Task, check_env, find_task, flat_size
+from gym_dgpmpc.agents.saving import collect, load_agent
+from gym_dgpmpc.agents.task import Task, find_task, flat_size, wrapped_env
 from gym_dgpmpc.data.transitions import TransitionStore
-from gym_dgpmpc.errors import CheckpointError, DGPMPCError, EnvironmentDataError
+from gym_dgpmpc.errors import EnvironmentDataError
 from gym_dgpmpc.types import DynamicsModel, Planner, RewardFn, TerminatedFn
 
 SelfAgent = TypeVar("SelfAgent", bound="PlanningAgent")
@@ -33,6 +31,13 @@ SelfAgent = TypeVar("SelfAgent", bound="PlanningAgent")
 
 class PlanningAgent(BaseAlgorithm):
     """What every agent that plans through a learned model offers to SB3's helpers; see `MPCAgent` for the arguments."""
+
+    observation_space: spaces.Box
+    action_space: spaces.Box
+    dynamics: DynamicsModel
+    planner: Planner
+    seed: int
+    _last_obs: np.ndarray | None
 
     saved_arguments: ClassVar[tuple[str, ...]] = (
         "num_particles",
@@ -66,8 +71,7 @@ class PlanningAgent(BaseAlgorithm):
         if learning_starts is not None and learning_starts < 1:
             raise ValueError(f"learning_starts must be at least 1, got {learning_starts}")
         if env is not None:
-            env = self._wrap_env(maybe_make_env(env, 0))
-            check_env(env)
+            env = wrapped_env(env)
         super().__init__(
             policy=BasePolicy,
             env=env,
@@ -79,7 +83,10 @@ class PlanningAgent(BaseAlgorithm):
             supported_action_spaces=(spaces.Box,),
         )
         self.verbose, self.stats_window_size = verbose, stats_window_size
-        self.dynamics, self.planner = dynamics, planner
+        if dynamics is not None:
+            self.dynamics = dynamics
+        if planner is not None:
+            self.planner = planner
         self.num_particles, self.actions_per_plan = num_particles, actions_per_plan
         self.learning_starts = learning_starts
         self.given_reward_fn, self.given_terminated_fn = reward_fn, terminated_fn
@@ -92,7 +99,7 @@ class PlanningAgent(BaseAlgorithm):
 
     def _setup_model(self) -> None:
         """Create what an untrained agent has, once the spaces are known."""
-        if self.dynamics is None or self.planner is None:
+        if not hasattr(self, "dynamics") or not hasattr(self, "planner"):
             raise ValueError("an MPCAgent is made of a dynamics model and a planner: pass dynamics=... and planner=...")
         self.store = TransitionStore(flat_size(self.observation_space), flat_size(self.action_space))
         self.generators = split_seed(self.seed, self.device)
@@ -179,10 +186,8 @@ class PlanningAgent(BaseAlgorithm):
             ValueError: its spaces are others, or it cannot be planned for.
             UnknownRewardError: there is no reward function.
         """
-        env = self._wrap_env(env)
-        check_env(env)
-        spaces_of_both = env.observation_space, env.action_space
-        task = find_task(env, *spaces_of_both, self.given_reward_fn, self.given_terminated_fn)
+        env = wrapped_env(env)
+        task = find_task(env, self.given_reward_fn, self.given_terminated_fn)
         self.n_envs = env.num_envs  # an agent loaded without an environment has none
         super().set_env(env, force_reset)
         self._task = task
@@ -210,7 +215,7 @@ class PlanningAgent(BaseAlgorithm):
 
     def save(
         self,
-        path: str | pathlib.Path | io.BufferedIOBase,
+        path: CheckpointPath,
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
     ) -> None:
@@ -228,7 +233,7 @@ class PlanningAgent(BaseAlgorithm):
     @classmethod
     def load(
         cls: type[SelfAgent],
-        path: str | pathlib.Path | io.BufferedIOBase,
+        path: CheckpointPath,
         env: GymEnv | None = None,
         device: torch.device | str = "cpu",
         custom_objects: dict[str, Any] | None = None,
@@ -257,29 +262,7 @@ class PlanningAgent(BaseAlgorithm):
         """
         if print_system_info:
             get_system_info()
-        checkpoint = read_checkpoint(path)
-        agent_class = class_of(checkpoint, cls)
-        arguments = saved_arguments(checkpoint, agent_class) | kwargs
-        spaces_of_both = saved_spaces(checkpoint)
-        if env is not None:
-            env = cls._wrap_env(maybe_make_env(env, 0))
-            check_env(env)
-            if (env.observation_space, env.action_space) != spaces_of_both:
-                raise CheckpointError(
-                    f"the agent was saved for observations {spaces_of_both[0]} and actions {spaces_of_both[1]}, "
-                    f"the environment has {env.observation_space} and {env.action_space}"
-                )
-        try:
-            agent = agent_class(env, device=device, _init_setup_model=False, **arguments)
-            agent.observation_space, agent.action_space = spaces_of_both
-            agent.n_envs = 1
-            agent._setup_model()
-        except DGPMPCError:
-            raise
-        except Exception as error:
-            raise CheckpointError(f"no {agent_class.__name__} can be made with {arguments}: {error}") from error
-        restore(agent, checkpoint, keep_generators="seed" not in kwargs, force_reset=force_reset)
-        return agent
+        return load_agent(cls, path, env, device, force_reset, kwargs)
 
     def get_parameters(self) -> dict[str, dict]:
         """The learned state of the dynamics model, by SB3's name for such things."""
@@ -301,9 +284,8 @@ class PlanningAgent(BaseAlgorithm):
         self.dynamics.load_state_dict(load_path_or_dict["dynamics"])
 
     def _find_task(self) -> Task:
-        return find_task(
-            self.env, self.observation_space, self.action_space, self.given_reward_fn, self.given_terminated_fn
-        )
+        both_spaces = self.observation_space, self.action_space
+        return find_task(self.env, self.given_reward_fn, self.given_terminated_fn, both_spaces)
 
     def _checked_observations(self, observation: Any) -> tuple[np.ndarray, bool]:
         """Observations as float32 [n, S], and whether they came with that first dimension."""

@@ -29,7 +29,7 @@ MAX_FILE_BYTES = 4 << 30
 MAX_JSON_BYTES = 16 << 20
 MAX_MEMBERS = 64
 
-CheckpointPath = str | os.PathLike[str] | IO[bytes]
+CheckpointPath = str | os.PathLike[str] | IO[bytes] | io.BufferedIOBase
 
 
 class Checkpoint(NamedTuple):
@@ -95,7 +95,7 @@ def read_checkpoint(path: CheckpointPath) -> Checkpoint:
         return _read(file, str(source))
 
 
-def _read(file: IO[bytes], where: str) -> Checkpoint:
+def _read(file: IO[bytes] | io.BufferedIOBase, where: str) -> Checkpoint:
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
     if size > MAX_FILE_BYTES:
@@ -149,7 +149,7 @@ def _read_archive(archive: zipfile.ZipFile, size: int, where: str) -> Checkpoint
     return Checkpoint(config, tensors)
 
 
-def _write_zip(members: dict[str, bytes], file: IO[bytes]) -> None:
+def _write_zip(members: dict[str, bytes], file: IO[bytes] | io.BufferedIOBase) -> None:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in members.items():
             # A fixed date: the same agent gives the same bytes.

@@ -107,12 +107,12 @@ class MPCAgent(PlanningAgent):
         """Algorithm 2 of the paper, one pass through the loop per control step."""
         while self.num_timesteps < total_timesteps:
             # For each episode: train the model, that is, optimise {Z, theta, beta} and sample U.
-            if self._last_episode_starts[0]:
+            if self._starts_episode:
                 self._begin_episode(callback)
             self._fit_if_due()
 
             # Sample K action sequences and P trajectories of each, update m and v by their returns, repeat.
-            observation = self._last_obs[0]
+            observation = self._observation
             if self.is_exploring:
                 action = self.planning.uniform(self.generators.exploration)
             else:
@@ -135,8 +135,9 @@ class MPCAgent(PlanningAgent):
 
     def _begin_episode(self, callback: BaseCallback) -> None:
         """A new episode starts with a cold plan."""
-        if not np.all(np.isfinite(self._last_obs)):
-            received, self._last_obs = self._last_obs[0], None
+        received = self._observation
+        if not np.all(np.isfinite(received)):
+            self._last_obs = None
             raise EnvironmentDataError(
                 f"after {self.num_timesteps} steps: the environment's reset returned an observation that is not "
                 f"finite: {received}"
@@ -148,7 +149,7 @@ class MPCAgent(PlanningAgent):
 
     def _fit_if_due(self) -> None:
         """Train if an episode ended, or exploration did, and there is something new to learn from."""
-        due = not self.is_exploring and (self._last_episode_starts[0] or not self.is_fitted)
+        due = not self.is_exploring and (self._starts_episode or not self.is_fitted)
         if not due or len(self.store) == self.num_fitted:
             return
         started = time.perf_counter()
@@ -174,7 +175,9 @@ class MPCAgent(PlanningAgent):
         """Step the environment and store what it did; a step counts only once it is stored."""
         # Until then there is no observation to go on from: after an error, learn begins a new episode.
         self._last_obs = None
+        assert self.env is not None
         new_obs, rewards, dones, infos = self.env.step(action.reshape(1, *self.action_space.shape))
+        assert isinstance(new_obs, np.ndarray)
         # At an episode's end the environment has been reset already, and the true next observation is set aside.
         next_observation = infos[0]["terminal_observation"] if dones[0] else new_obs[0]
         terminated = bool(dones[0]) and not infos[0].get("TimeLimit.truncated", False)
@@ -212,6 +215,18 @@ class MPCAgent(PlanningAgent):
         if log_interval is not None and self._episode_num % log_interval == 0:
             self.dump_logs()
         callback.on_rollout_end()
+
+    @property
+    def _observation(self) -> np.ndarray:
+        """The present observation, [S]."""
+        assert self._last_obs is not None
+        return self._last_obs[0]
+
+    @property
+    def _starts_episode(self) -> bool:
+        """Whether the present observation is the first of an episode."""
+        assert self._last_episode_starts is not None
+        return bool(self._last_episode_starts[0])
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         # SB3 prints its tables at verbose=1; here that level is one line per episode.

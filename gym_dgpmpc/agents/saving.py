@@ -15,19 +15,23 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.type_aliases import GymEnv
 from torch import Tensor
 
-from gym_dgpmpc.agents.checkpoint import Checkpoint
+from gym_dgpmpc.agents.checkpoint import Checkpoint, CheckpointPath, read_checkpoint
 from gym_dgpmpc.agents.plan_state import pack, unpack
 from gym_dgpmpc.agents.randomness import derive_seed
-from gym_dgpmpc.agents.task import offered_by
-from gym_dgpmpc.errors import CheckpointError
+from gym_dgpmpc.agents.task import offered_by, wrapped_env
+from gym_dgpmpc.errors import CheckpointError, DGPMPCError
 from gym_dgpmpc.types import ObservationSpec, StateDict
 
 AGENT_CLASSES = {"MPCAgent": "gym_dgpmpc.agents.mpc", "DGPMPCAgent": "gym_dgpmpc.agents.dgp_mpc"}
 """The classes that a file may name, and where they are; nothing else is ever imported for a file."""
 
 PACKAGES = ("gym_dgpmpc", "gymnasium", "numpy", "stable_baselines3", "torch")
+MAX_NUMBER = 10**7
+"""No numeric argument in a file may exceed this, so that none makes a constructor take up the memory."""
+
 COUNTERS = ("num_timesteps", "num_fitted", "_episode_num", "_episode_index", "_explored_episode")
 
 
@@ -64,12 +68,53 @@ def collect(agent: Any) -> Checkpoint:
     return Checkpoint(config, {part: _only_tensors(state) for part, state in tensors.items()})
 
 
-def class_of(checkpoint: Checkpoint, asked: type) -> type:
-    """The class that a file names: one of the package's, or the very class that was asked to load it.
+def load_agent(
+    asked: Any,
+    path: CheckpointPath,
+    env: GymEnv | str | None,
+    device: torch.device | str,
+    force_reset: bool,
+    replaced: dict[str, Any],
+) -> Any:
+    """Make the agent that a file holds; see `PlanningAgent.load`.
+
+    Args:
+        asked: the class whose `load` was called.
+        path: the file.
+        env: the environment to go on in, or None.
+        device: where planning computes.
+        force_reset: begin a new episode when learning goes on, instead of the one that was running.
+        replaced: constructor arguments in place of the saved ones.
 
     Raises:
-        CheckpointError: it is another class, or not a subclass of the one asked.
+        CheckpointError: the file cannot be read, holds something else, or does not fit ``env``.
     """
+    checkpoint = read_checkpoint(path)
+    agent_class = _class_of(checkpoint, asked)
+    arguments = _saved_arguments(checkpoint, agent_class) | replaced
+    both_spaces = _saved_spaces(checkpoint)
+    if env is not None:
+        env = wrapped_env(env)
+        if (env.observation_space, env.action_space) != both_spaces:
+            raise CheckpointError(
+                f"the agent was saved for observations {both_spaces[0]} and actions {both_spaces[1]}, "
+                f"the environment has {env.observation_space} and {env.action_space}"
+            )
+    try:
+        agent = agent_class(env, device=device, _init_setup_model=False, **arguments)
+        agent.observation_space, agent.action_space = both_spaces
+        agent.n_envs = 1
+        agent._setup_model()
+    except DGPMPCError:
+        raise
+    except Exception as error:
+        raise CheckpointError(f"no {agent_class.__name__} can be made with {arguments}: {error}") from error
+    _restore(agent, checkpoint, keep_generators="seed" not in replaced, force_reset=force_reset)
+    return agent
+
+
+def _class_of(checkpoint: Checkpoint, asked: type) -> Any:
+    """The class that a file names: one of the package's, or the very class that was asked to load it."""
     name = checkpoint.config.get("class")
     if name == asked.__name__:
         return asked
@@ -81,12 +126,8 @@ def class_of(checkpoint: Checkpoint, asked: type) -> type:
     return found
 
 
-def saved_arguments(checkpoint: Checkpoint, agent_class: Any) -> dict[str, Any]:
-    """The constructor arguments in a file, decoded.
-
-    Raises:
-        CheckpointError: they are not those of the class.
-    """
+def _saved_arguments(checkpoint: Checkpoint, agent_class: Any) -> dict[str, Any]:
+    """The constructor arguments in a file, decoded."""
     arguments = checkpoint.config.get("arguments")
     if not isinstance(arguments, dict) or set(arguments) != set(agent_class.saved_arguments):
         received = sorted(arguments) if isinstance(arguments, dict) else arguments
@@ -94,15 +135,14 @@ def saved_arguments(checkpoint: Checkpoint, agent_class: Any) -> dict[str, Any]:
             f"the file's arguments are not those of {agent_class.__name__}: expected "
             f"{sorted(agent_class.saved_arguments)}, got {received}"
         )
+    for name, value in arguments.items():
+        if name != "seed" and isinstance(value, int | float) and not abs(value) <= MAX_NUMBER:
+            raise CheckpointError(f"the file's argument {name} = {value} is larger than any agent's")
     return {name: _decode(value) for name, value in arguments.items()}
 
 
-def saved_spaces(checkpoint: Checkpoint) -> tuple[spaces.Box, spaces.Box]:
-    """Observation and action space of the saved agent.
-
-    Raises:
-        CheckpointError: the file does not describe two boxes.
-    """
+def _saved_spaces(checkpoint: Checkpoint) -> tuple[spaces.Box, spaces.Box]:
+    """Observation and action space of the saved agent."""
     try:
         return tuple(  # type: ignore[return-value]
             spaces.Box(
@@ -116,18 +156,8 @@ def saved_spaces(checkpoint: Checkpoint) -> tuple[spaces.Box, spaces.Box]:
         raise CheckpointError(f"the file does not describe the spaces of its agent: {error!r}") from error
 
 
-def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True, force_reset: bool = True) -> None:
-    """Put a file's contents into a freshly constructed agent of the same arguments.
-
-    Args:
-        agent: the agent.
-        checkpoint: what `collect` returned for another.
-        keep_generators: continue the saved random streams; otherwise those of the agent's own seed begin.
-        force_reset: begin a new episode when learning goes on, instead of the one that was running.
-
-    Raises:
-        CheckpointError: something is missing or does not fit the agent.
-    """
+def _restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True, force_reset: bool = True) -> None:
+    """Put a file's contents into a freshly constructed agent; see `load_agent`."""
     config, parts = checkpoint
     try:
         state = {part: {**tensors, **config["values"].get(part, {})} for part, tensors in parts.items()}

@@ -1,11 +1,14 @@
 """What the agent must know of its environment, found on it or given by the user, and checked at construction."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from torch import Tensor
 
@@ -24,12 +27,22 @@ class Task(NamedTuple):
     """None: as far as the planner knows, episodes do not end."""
 
 
+def wrapped_env(env: GymEnv | str) -> VecEnv:
+    """The environment, or the registered one of this id, as a monitored VecEnv that can be planned for.
+
+    Raises:
+        ValueError, AssertionError: see `check_env`.
+    """
+    vec_env = BaseAlgorithm._wrap_env(maybe_make_env(env, 0))
+    check_env(vec_env)
+    return vec_env
+
+
 def find_task(
     env: VecEnv | None,
-    observation_space: spaces.Box,
-    action_space: spaces.Box,
     reward_fn: RewardFn | None,
     terminated_fn: TerminatedFn | None,
+    both_spaces: tuple[spaces.Space, spaces.Space] | None = None,
 ) -> Task:
     """The reward and termination to plan with: what the user gave, else what the environment (if any) offers.
 
@@ -38,7 +51,10 @@ def find_task(
         ValueError: a function does not return one value per state of a batch.
         TypeError: a function is not callable or does not return a tensor.
     """
-    size = flat_size(observation_space), flat_size(action_space)
+    if both_spaces is None and env is not None:
+        both_spaces = env.observation_space, env.action_space
+    assert both_spaces is not None, "find_task needs an environment or its spaces"
+    size = flat_size(both_spaces[0]), flat_size(both_spaces[1])
     reward_fn = offered_by(env, "reward_fn") if reward_fn is None else reward_fn
     terminated_fn = offered_by(env, "terminated_fn") if terminated_fn is None else terminated_fn
     if reward_fn is None:
@@ -48,7 +64,7 @@ def find_task(
             f"agent or give the environment that attribute, with the signature {REWARD_SIGNATURE} where S = {size[0]}, "
             f"A = {size[1]} and *b stands for any leading dimensions"
         )
-    observation, action, next_observation = _example_batch(observation_space, action_space)
+    observation, action, next_observation = _example_batch(*both_spaces)
     _check_function("reward_fn", REWARD_SIGNATURE, reward_fn, (observation, action, next_observation), is_bool=False)
     if terminated_fn is not None:
         _check_function("terminated_fn", TERMINATED_SIGNATURE, terminated_fn, (next_observation,), is_bool=True)
@@ -114,12 +130,13 @@ def flat_size(space: spaces.Space) -> int:
     return int(np.prod(space.shape or ()))
 
 
-def _example_batch(observation_space: spaces.Box, action_space: spaces.Box) -> tuple[Tensor, Tensor, Tensor]:
+def _example_batch(observation_space: spaces.Space, action_space: spaces.Space) -> tuple[Tensor, Tensor, Tensor]:
     """Two-dimensional batches [3, 2] of observations, actions and next observations to try a function on."""
     batch = []
     for seed, space in enumerate((observation_space, action_space, observation_space)):
         # A space of its own, so that the environment's sampling is not advanced.
-        box = spaces.Box(space.low, space.high, dtype=space.dtype, seed=seed)
+        box = deepcopy(space)
+        box.seed(seed)
         samples = np.stack([box.sample().ravel() for _ in range(6)])
         batch.append(torch.from_numpy(samples).float().reshape(3, 2, -1))
     return batch[0], batch[1], batch[2]
