@@ -53,7 +53,7 @@ def correlation_(kernel: Kernel, argument: Float[Tensor, "*b"]) -> Float[Tensor,
     decay = torch.neg(s).exp_()
     if kernel == "matern32":
         return torch.addcmul(decay, s, decay, out=s)
-    return torch.addcmul(s, s, s, value=1 / 3).add_(1.0).mul_(decay)
+    return s.addcmul_(s, s, value=1 / 3).add_(1.0).mul_(decay)
 
 
 def _correlation_and_slope(kernel: Kernel, sqdist: Tensor) -> tuple[Tensor, Tensor]:
