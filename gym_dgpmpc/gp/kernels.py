@@ -15,7 +15,7 @@ Kernel = Literal["rbf", "matern52", "matern32", "matern12"]
 
 KERNELS: tuple[Kernel, ...] = get_args(Kernel)
 
-# Matern-1/2 has an infinite slope in r^2 at zero; below this r^2 the slope is taken as that of the floor.
+# Below this r^2 two points are one: rounding of r^2 would show in Matern-1/2, and its slope there is infinite.
 _SQDIST_FLOOR = 1e-12
 
 _ORDER = {"matern12": 0.5, "matern32": 1.5, "matern52": 2.5}
@@ -62,10 +62,10 @@ def _correlation_and_slope(kernel: Kernel, sqdist: Tensor) -> tuple[Tensor, Tens
         value = torch.exp(-0.5 * sqdist.clamp_min(0.0))
         return value, -0.5 * value
     order = _ORDER[kernel]
-    s = torch.sqrt(2 * order * sqdist.clamp_min(_SQDIST_FLOOR))
+    s = torch.sqrt(2 * order * torch.threshold(sqdist, _SQDIST_FLOOR, 0.0))
     decay = torch.exp(-s)
     if kernel == "matern12":
-        return decay, -0.5 * decay / s
+        return decay, -0.5 * decay / s.clamp_min(_SQDIST_FLOOR**0.5)
     if kernel == "matern32":
         return torch.addcmul(decay, s, decay), -1.5 * decay
     slope = torch.addcmul(decay, s, decay).mul_(-5 / 6)
