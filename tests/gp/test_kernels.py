@@ -1,0 +1,98 @@
+"""Kernels against their definitions, and their hand-written derivative against finite differences."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gym_dgpmpc.gp.kernels import (
+    KERNELS,
+    argument_scale,
+    check_kernel,
+    correlation,
+    correlation_,
+    pairwise_sqdist,
+    scaled_sqdist,
+    smoothness,
+)
+from tests.oracles import gaussian_process
+from tests.oracles.models import normal, seeded
+
+DISTANCES = torch.cat([torch.logspace(-4, 1.3, 60, dtype=torch.float64), torch.tensor([1.0], dtype=torch.float64)])
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_values_are_those_of_the_definition(kernel):
+    value = correlation(kernel, DISTANCES.square())
+    exact = gaussian_process.correlation(kernel, DISTANCES.numpy())
+    # The Bessel function of scipy loses digits of its own where k is tiny or r is.
+    np.testing.assert_allclose(value, exact, rtol=1e-10, atol=1e-14)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_the_in_place_form_agrees(kernel, dtype):
+    sqdist = DISTANCES.square().to(dtype)
+    argument = argument_scale(kernel) * sqdist
+    out = correlation_(kernel, argument)
+    assert out.data_ptr() == argument.data_ptr(), "it must not allocate a result"
+    rounding = 100 * torch.finfo(dtype).eps  # |d k| <= s e^-s |d s / s| and a few elementwise roundings
+    torch.testing.assert_close(out, correlation(kernel, sqdist), rtol=0, atol=rounding)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_coincident_points_have_unit_correlation_even_if_rounding_makes_them_negative(kernel):
+    sqdist = torch.tensor([0.0, -1e-16, -1e-7], dtype=torch.float64, requires_grad=True)
+    value = correlation(kernel, sqdist)
+    assert torch.equal(value, torch.ones(3, dtype=torch.float64))
+    (gradient,) = torch.autograd.grad(value.sum(), sqdist)
+    assert gradient.isfinite().all()
+    in_place = correlation_(kernel, argument_scale(kernel) * sqdist.detach())
+    assert torch.equal(in_place, torch.ones(3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_the_gradient_is_that_of_finite_differences(kernel):
+    sqdist = torch.tensor([1e-2, 0.3, 1.0, 4.0, 20.0], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda r2: correlation(kernel, r2), sqdist, eps=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_the_gradient_reaches_points_and_lengthscales(kernel):
+    generator = seeded()
+    x, z = normal(generator, 4, 3), normal(generator, 2, 3)
+    lengthscale = 0.5 + torch.rand(3, generator=generator, dtype=torch.float64)
+    inputs = tuple(t.requires_grad_() for t in (x, z, lengthscale))
+    assert torch.autograd.gradcheck(lambda x, z, ls: correlation(kernel, scaled_sqdist(x, z, ls)), inputs)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_covariances_are_positive_definite(kernel):
+    x = normal(seeded(), 40, 3)
+    eigenvalues = torch.linalg.eigvalsh(correlation(kernel, pairwise_sqdist(x)))
+    assert eigenvalues.min() > -1e-12
+    assert eigenvalues.sum().item() == pytest.approx(40, abs=1e-4)
+
+
+def test_squared_distances_are_those_of_the_differences():
+    generator = seeded()
+    x, z = normal(generator, 2, 5, 3), normal(generator, 4, 3)
+    lengthscale = torch.tensor([0.5, 1.0, 3.0], dtype=torch.float64)
+    exact = ((x.unsqueeze(-2) - z) / lengthscale).square().sum(-1)
+    torch.testing.assert_close(scaled_sqdist(x, z, lengthscale), exact, rtol=0, atol=1e-13)
+    exact = (x.unsqueeze(-2) - x.unsqueeze(-3)).square().sum(-1)
+    torch.testing.assert_close(pairwise_sqdist(x), exact, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "order"), [("rbf", math.inf), ("matern52", 2.5), ("matern32", 1.5), ("matern12", 0.5)]
+)
+def test_the_order_of_smoothness(kernel, order):
+    assert smoothness(kernel) == order
+
+
+@pytest.mark.parametrize("kernel", ["RBF", "matern", "", "matern72"])
+def test_an_unknown_kernel_is_named_with_the_known_ones(kernel):
+    with pytest.raises(ValueError, match=rf"unknown kernel '{kernel}'.*rbf, matern52, matern32, matern12"):
+        check_kernel(kernel)

@@ -1,0 +1,35 @@
+"""Small hand-made deep Gaussian processes, in torch and as the numpy oracle sees them."""
+
+import torch
+from torch import Tensor
+
+from gym_dgpmpc.gp.deep_gp import DeepGP
+from gym_dgpmpc.gp.layer import Layer
+from tests.oracles.gaussian_process import DenseLayer
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def normal(generator: torch.Generator, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def make_model(
+    num_layers: int, input_size: int, num_targets: int, num_inducing: int, generator: torch.Generator
+) -> DeepGP:
+    """Random inducing inputs, unequal lengthscales and variances; an inner layer that bends its input noticeably."""
+
+    def layer(variance: float) -> Layer:
+        lengthscale = 0.8 + torch.rand(input_size, generator=generator, dtype=torch.float64)
+        inducing_inputs = 1.5 * normal(generator, num_inducing, input_size)
+        return Layer(inducing_inputs, lengthscale.log(), torch.tensor(variance, dtype=torch.float64).log())
+
+    inner = [layer(0.15) for _ in range(num_layers - 1)]
+    noise = 0.1 + 0.2 * torch.rand(num_targets, generator=generator, dtype=torch.float64)
+    return DeepGP((*inner, layer(1.7)), noise.log())
+
+
+def dense(layer: Layer) -> DenseLayer:
+    return DenseLayer(layer.inducing_inputs.numpy(), layer.lengthscale.numpy(), float(layer.variance))
