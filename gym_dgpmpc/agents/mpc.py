@@ -199,7 +199,7 @@ class MPCAgent(PlanningAgent):
                 "the environment ended an episode by termination, which the planner knows nothing of: pass "
                 "terminated_fn=..., or give the environment an attribute of that name"
             )
-        return rewards, dones, infos
+        return rewards, dones, list(infos)
 
     def _end_episode(
         self, infos: list[dict[str, Any]], dones: np.ndarray, callback: BaseCallback, log_interval: int
