@@ -96,8 +96,12 @@ class DeepGPDynamics:
         device: torch.device | str = "cpu",
     ):
         counts = {
-            "num_layers": num_layers, "num_inducing": num_inducing, "num_features": num_features,
-            "first_iterations": first_iterations, "iterations": iterations, "num_samples": num_samples,
+            "num_layers": num_layers,
+            "num_inducing": num_inducing,
+            "num_features": num_features,
+            "first_iterations": first_iterations,
+            "iterations": iterations,
+            "num_samples": num_samples,
             "sample_spacing": sample_spacing,
         }
         for name, value in counts.items():
@@ -149,8 +153,14 @@ class DeepGPDynamics:
         )
         chains = list(
             mcem.sample(
-                self.kernel, trained.model, trained.chain, standardised, self.num_samples, self.sample_spacing,
-                generator, self.inference,
+                self.kernel,
+                trained.model,
+                trained.chain,
+                standardised,
+                self.num_samples,
+                self.sample_spacing,
+                generator,
+                self.inference,
             )
         )
         pool = torch.stack([chain.position for chain in chains])
@@ -170,7 +180,14 @@ class DeepGPDynamics:
         x, y = self._encode(data)
         standardised = Data(fitted.normalisers[0](x), fitted.normalisers[1](y))
         (chain,) = mcem.sample(
-            self.kernel, fitted.model, fitted.chain, standardised, 1, self.resample_steps, generator, self.inference,
+            self.kernel,
+            fitted.model,
+            fitted.chain,
+            standardised,
+            1,
+            self.resample_steps,
+            generator,
+            self.inference,
             self._factors,
         )
         fitted.pool[fitted.oldest] = chain.position
@@ -228,7 +245,9 @@ class DeepGPDynamics:
             return value.to(self.device, torch.float64).clone()
 
         layers = tuple(
-            Layer(*(take(f"layers.{i}.{name}", *shape) for name, shape in zip(Layer._fields, layer_shapes, strict=True)))
+            Layer(
+                *(take(f"layers.{i}.{name}", *shape) for name, shape in zip(Layer._fields, layer_shapes, strict=True))
+            )
             for i in range(self.num_layers)
         )
         sizes = (self.encoder.input_size, self.encoder.target_size)

@@ -78,8 +78,14 @@ class _PathwiseLayer(NamedTuple):
 
 
 def _draw_layer(
-    kernel: Kernel, layer: Layer, factor: Tensor, whitened: Tensor, num_functions: int, num_features: int,
-    dtype: torch.dtype, generator: torch.Generator,
+    kernel: Kernel,
+    layer: Layer,
+    factor: Tensor,
+    whitened: Tensor,
+    num_functions: int,
+    num_features: int,
+    dtype: torch.dtype,
+    generator: torch.Generator,
 ) -> _PathwiseLayer:
     """Draw ``num_functions`` functions per particle from p(f | u), by Matheron's rule.
 
@@ -135,8 +141,14 @@ class PathwiseSampler:
     """
 
     def __init__(
-        self, posterior: Posterior, coordinates: Coordinates, horizon: int, num_features: int, refresh: Refresh,
-        dtype: torch.dtype, generator: torch.Generator,
+        self,
+        posterior: Posterior,
+        coordinates: Coordinates,
+        horizon: int,
+        num_features: int,
+        refresh: Refresh,
+        dtype: torch.dtype,
+        generator: torch.Generator,
     ):
         kernel, model, factors, whitened = posterior
         num_functions = horizon if refresh == "step" else 1

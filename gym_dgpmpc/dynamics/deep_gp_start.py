@@ -43,9 +43,7 @@ def cluster(x: Float[Tensor, "N D"], num_clusters: int, generator: torch.Generat
     num_rows = x.shape[0]
     if num_rows <= num_clusters:
         extra = torch.randint(num_rows, (num_clusters - num_rows,), generator=generator, device=x.device)
-        spread = 0.1 * torch.randn(
-            len(extra), x.shape[1], generator=generator, dtype=x.dtype, device=x.device
-        )
+        spread = 0.1 * torch.randn(len(extra), x.shape[1], generator=generator, dtype=x.dtype, device=x.device)
         return torch.cat([x, x[extra] + spread])
     seed = int(torch.randint(2**31, (), generator=generator, device=x.device))
     # An empty cluster keeps its last centre, which is as good an inducing input as any.

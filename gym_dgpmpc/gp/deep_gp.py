@@ -36,13 +36,17 @@ class DeepGP(NamedTuple):
 
     def split(self, whitened: Float[Tensor, "*p V"]) -> list[Tensor]:
         """The layers' whitened inducing outputs v_l "*p M_l O_l" as views of one flat vector, as inference keeps it."""
-        shapes = [(layer.inducing_inputs.shape[0], size) for layer, size in zip(self.layers, self.output_sizes(), strict=True)]
+        shapes = [
+            (layer.inducing_inputs.shape[0], size) for layer, size in zip(self.layers, self.output_sizes(), strict=True)
+        ]
         parts = whitened.split([m * o for m, o in shapes], dim=-1)
         return [part.unflatten(-1, shape) for part, shape in zip(parts, shapes, strict=True)]
 
     def num_whitened(self) -> int:
         """V, the length of the flat vector of all whitened inducing outputs."""
-        return sum(layer.inducing_inputs.shape[0] * o for layer, o in zip(self.layers, self.output_sizes(), strict=True))
+        return sum(
+            layer.inducing_inputs.shape[0] * o for layer, o in zip(self.layers, self.output_sizes(), strict=True)
+        )
 
     def parameters(self) -> list[Tensor]:
         """The tensors that the hyperparameter optimiser moves."""

@@ -35,6 +35,9 @@ def cholesky(
     finite = bool(torch.isfinite(covariance).all())
     raise FactorisationError(
         f"a covariance of shape {tuple(covariance.shape)} could not be factorised: "
-        + (f"jitter up to {_LADDER[-1] * jitter:g} of the kernel's variance did not help" if finite
-           else "it holds values that are not finite")
+        + (
+            f"jitter up to {_LADDER[-1] * jitter:g} of the kernel's variance did not help"
+            if finite
+            else "it holds values that are not finite"
+        )
     )

@@ -76,7 +76,12 @@ def negative_log_joint(
 
 
 def _gradient(
-    kernel: Kernel, model: DeepGP, factors: list[Tensor], chain: SGHMCState, batch: Data, num_data: int,
+    kernel: Kernel,
+    model: DeepGP,
+    factors: list[Tensor],
+    chain: SGHMCState,
+    batch: Data,
+    num_data: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """The negative log joint at the chain's position and its gradient there, hyperparameters held fixed."""
@@ -163,7 +168,5 @@ def sample(
 
 def _rebuild(model: DeepGP, parameters: list[Tensor]) -> DeepGP:
     """``model`` with its tensors replaced, in the order of `DeepGP.parameters`."""
-    layers = tuple(
-        type(layer)(*parameters[3 * i : 3 * i + 3]) for i, layer in enumerate(model.layers)
-    )
+    layers = tuple(type(layer)(*parameters[3 * i : 3 * i + 3]) for i, layer in enumerate(model.layers))
     return DeepGP(layers, parameters[-1])

@@ -71,8 +71,8 @@ def step(
         state = adapt(state, gradient)
     inverse_mass = state.inverse_mass()
     variance = (2.0 * step_size**2 / num_data * decay * inverse_mass).clamp_min(_TINY)
-    noise = torch.randn(
-        gradient.shape, generator=generator, dtype=gradient.dtype, device=gradient.device
-    ) * variance.sqrt()
+    noise = (
+        torch.randn(gradient.shape, generator=generator, dtype=gradient.dtype, device=gradient.device) * variance.sqrt()
+    )
     momentum = (1.0 - decay) * state.momentum - step_size**2 * inverse_mass * gradient + noise
     return state._replace(position=state.position + momentum, momentum=momentum)
