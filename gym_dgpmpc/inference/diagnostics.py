@@ -11,20 +11,21 @@ def effective_sample_size(samples: Float[Tensor, "n V"]) -> Float[Tensor, "V"]:
     The sum runs over pairs of neighbouring lags while the pair is positive (Geyer 1992, initial positive sequence).
     A coordinate that does not move has an ESS of zero.
     """
-    n = samples.shape[0]
+    n, size = samples.shape
     centred = samples.double() - samples.double().mean(0)
     spectrum = torch.fft.rfft(centred, n=2 * n, dim=0)
     autocovariance = torch.fft.irfft(spectrum.abs().square(), n=2 * n, dim=0)[:n] / n
     moving = autocovariance[0] > 0
     correlation = autocovariance / torch.where(moving, autocovariance[0], 1.0)
-    pairs = correlation[: n - n % 2].reshape(n // 2, 2, -1).sum(1)
+    pairs = correlation[: n - n % 2].reshape(n // 2, 2, size).sum(1)
     positive = (pairs > 0).cumprod(0)
     time = (2.0 * (pairs * positive).sum(0) - 1.0).clamp_min(1.0 / n)
     return torch.where(moving, n / time, 0.0)
 
 
 def split_r_hat(samples: Float[Tensor, "n V"]) -> Float[Tensor, "V"]:
-    """Split R-hat of each coordinate of one chain: 1 when its two halves agree (Gelman et al. 2013, section 11.4).
+    """Split R-hat of each coordinate of one chain: 1 when its two halves agree, infinite for two
+    halves at rest in different places (Gelman et al. 2013, section 11.4).
 
     Raises:
         ValueError: fewer than four samples.
@@ -37,4 +38,4 @@ def split_r_hat(samples: Float[Tensor, "n V"]) -> Float[Tensor, "V"]:
     within = halves.var(1).mean(0)
     between = half * halves.mean(1).var(0)
     pooled = (half - 1) / half * within + between / half
-    return torch.where(within > 0, (pooled / torch.where(within > 0, within, 1.0)).sqrt(), 1.0)
+    return torch.where(pooled == 0, 1.0, pooled / within).sqrt()
