@@ -1,0 +1,176 @@
+"""The store of everything observed: validated at the door, float32, growing without limit.
+
+Rows are copied in, and handed out as views. A buffer that is full is replaced by one of twice the size, so adding a
+row costs a constant on average.
+"""
+
+from typing import SupportsFloat
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from gym_dgpmpc.errors import CheckpointError, EnvironmentDataError
+from gym_dgpmpc.types import StateDict, Transitions
+
+
+class TransitionStore:
+    """The transitions of all episodes, in the order in which they were performed.
+
+    Nothing is stored of a batch that is refused, so what was gathered before is never lost to a bad observation.
+
+    Args:
+        observation_size: S.
+        action_size: A.
+        capacity: rows to reserve at first; the store grows beyond it by itself.
+
+    Raises:
+        ValueError: a size or the capacity is not positive.
+    """
+
+    def __init__(self, observation_size: int, action_size: int, capacity: int = 1024):
+        if min(observation_size, action_size, capacity) < 1:
+            raise ValueError(
+                "observation_size, action_size and capacity must be at least 1, "
+                f"got {observation_size}, {action_size} and {capacity}"
+            )
+        self.observation_size = observation_size
+        self.action_size = action_size
+        self._length = 0
+        self._buffers = {
+            "observation": torch.empty(capacity, observation_size),
+            "action": torch.empty(capacity, action_size),
+            "next_observation": torch.empty(capacity, observation_size),
+            "reward": torch.empty(capacity),
+            "terminated": torch.empty(capacity, dtype=torch.bool),
+            "episode": torch.empty(capacity, dtype=torch.int64),
+        }
+
+    def __len__(self) -> int:
+        return self._length
+
+    def append(
+        self,
+        observation: ArrayLike,
+        action: ArrayLike,
+        next_observation: ArrayLike,
+        *,
+        reward: SupportsFloat,
+        terminated: bool | np.bool_ = False,
+        episode: int = 0,
+    ) -> None:
+        """Add one step: ``observation`` and ``next_observation`` [S], ``action`` [A].
+
+        Raises:
+            EnvironmentDataError: a shape is wrong, or a component is not finite as float32.
+        """
+        row = (observation, action, next_observation, reward, terminated, episode)
+        self._add(*(np.asarray(value)[None] for value in row))
+
+    def extend(
+        self,
+        observation: ArrayLike,
+        action: ArrayLike,
+        next_observation: ArrayLike,
+        *,
+        reward: ArrayLike,
+        terminated: ArrayLike,
+        episode: ArrayLike,
+    ) -> None:
+        """Add n steps, or none of them: observations [n, S], actions [n, A] and the rest [n].
+
+        Raises:
+            EnvironmentDataError: a shape is wrong, or a component is not finite as float32.
+        """
+        rows = (observation, action, next_observation, reward, terminated, episode)
+        self._add(*(np.asarray(value) for value in rows))
+
+    def transitions(self) -> Transitions:
+        """All transitions, as views: they stay as they are when more rows are added, and must not be written to."""
+        return Transitions(*(self._view(name) for name in Transitions._fields))
+
+    @property
+    def rewards(self) -> Float[Tensor, " N"]:
+        return self._view("reward")
+
+    @property
+    def terminated(self) -> Bool[Tensor, " N"]:
+        return self._view("terminated")
+
+    @property
+    def episodes(self) -> Int[Tensor, " N"]:
+        """The index of the episode to which each row belongs."""
+        return self._view("episode")
+
+    def state_dict(self) -> StateDict:
+        """The rows, copied, without the spare capacity."""
+        return {name: self._view(name).clone() for name in self._buffers}
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Replace all rows by those of ``state``; on an error the store is as it was.
+
+        Raises:
+            CheckpointError: a field is missing or unknown, or does not fit the sizes of this store.
+        """
+        if set(state) != set(self._buffers):
+            raise CheckpointError(f"stored transitions have fields {sorted(self._buffers)}, got {sorted(state)}")
+        fields = []
+        for name in self._buffers:
+            value = state[name]
+            if not isinstance(value, Tensor) or value.dtype != self._buffers[name].dtype:
+                received = value.dtype if isinstance(value, Tensor) else type(value).__name__
+                raise CheckpointError(f"stored {name} must be a {self._buffers[name].dtype} tensor, got {received}")
+            fields.append(value.detach().cpu().numpy())
+        loaded = TransitionStore(self.observation_size, self.action_size, len(self._buffers["reward"]))
+        try:
+            loaded._add(*fields)
+        except EnvironmentDataError as error:
+            raise CheckpointError(f"the stored transitions do not fit this store: {error}") from error
+        self._buffers, self._length = loaded._buffers, loaded._length
+
+    def _view(self, name: str) -> Tensor:
+        return self._buffers[name][: self._length]
+
+    def _add(self, *fields: np.ndarray) -> None:
+        """Add rows, their fields in the order of the buffers: check every field, and only then write."""
+        rows = dict(zip(self._buffers, fields, strict=True))
+        count = len(rows["reward"]) if rows["reward"].ndim else 0
+        converted = {name: self._converted(name, value, count) for name, value in rows.items()}
+        self._reserve(self._length + count)
+        for name, value in converted.items():
+            self._buffers[name][self._length : self._length + count] = torch.from_numpy(value)
+        self._length += count
+
+    def _converted(self, name: str, value: np.ndarray, count: int) -> np.ndarray:
+        """``value`` in the buffer's dtype, or the error that says at which step what is wrong with it."""
+        buffer = self._buffers[name]
+        expected = (count, *buffer.shape[1:])
+        if value.shape != expected:
+            raise EnvironmentDataError(
+                f"step {self._length}: {name} must have shape {expected}, steps first, got {value.shape}"
+            )
+        dtype = torch.empty(0, dtype=buffer.dtype).numpy().dtype
+        if value.dtype.kind not in "fiub":
+            raise EnvironmentDataError(f"step {self._length}: {name} must be numeric, got dtype {value.dtype}")
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is reported below, with its place
+            converted = value.astype(dtype)
+        bad = np.argwhere(~np.isfinite(converted))
+        if len(bad):
+            row, *component = bad[0].tolist()
+            where = f"{name}{component or ''}"
+            raise EnvironmentDataError(
+                f"step {self._length + row}: {where} must be finite as float32, got {value[tuple(bad[0])]}"
+            )
+        return converted
+
+    def _reserve(self, length: int) -> None:
+        """Make room for ``length`` rows, at least doubling; views handed out keep the buffer they look into."""
+        capacity = len(self._buffers["reward"])
+        if length <= capacity:
+            return
+        for name, old in self._buffers.items():
+            new = old.new_empty(max(length, 2 * capacity), *old.shape[1:])
+            new[: self._length] = old[: self._length]
+            self._buffers[name] = new
