@@ -179,7 +179,9 @@ def _check_bounds(low: Tensor, high: Tensor) -> None:
         raise ValueError(
             f"action_low and action_high must share one floating-point dtype, got {low.dtype}, {high.dtype}"
         )
-    if not bool((low.isfinite() & high.isfinite() & (low <= high)).all()):
+    # The square, because some spaces are "bounded" by the largest number there is, whose variance overflows.
+    if not bool(((high - low).square().isfinite() & (low <= high)).all()):
         raise ValueError(
-            f"action_low must be finite and nowhere above action_high, got {low.tolist()} and {high.tolist()}"
+            "the action bounds must be finite, and action_low nowhere above action_high, "
+            f"got {low.tolist()} and {high.tolist()}"
         )
