@@ -3,12 +3,15 @@
 The hook has to be installed before anything imports the package, and this file is what pytest imports first.
 """
 
+import sys
 import typing
 from collections.abc import Iterator
+from pathlib import Path
 
+import jaxtyping
+import pytest
 import torch
 from beartype import beartype
-from jaxtyping import install_import_hook
 
 
 def typechecked(function):
@@ -27,6 +30,13 @@ def _parts(hint: object) -> Iterator[object]:
         yield from _parts(argument)
 
 
-install_import_hook("gym_dgpmpc", f"{__name__}.typechecked")
+sys.path.insert(0, str(Path(__file__).parents[1]))  # tests.oracles, however pytest was started
+jaxtyping.install_import_hook("gym_dgpmpc", f"{__name__}.typechecked")
 
 torch.set_num_threads(1)  # the same sums in the same order on every machine, and no fight over cores
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Annotations unchecked, as in production, to see the package's own error for an argument of the wrong shape."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)

@@ -1,0 +1,192 @@
+"""The cross-entropy method against its own recursion, its sampling law and the exact optimum of an LQR."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.stats
+import torch
+
+from gym_dgpmpc.planning import CEM, rollout_objective
+from gym_dgpmpc.planning.cem import truncated_normal
+from gym_dgpmpc.types import Plan
+from tests.oracles import lqr
+
+CPU = torch.device("cpu")
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def bounds(low, high, dtype=torch.float32):
+    return {"action_low": torch.tensor(low, dtype=dtype), "action_high": torch.tensor(high, dtype=dtype)}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_noise_is_a_normal_truncated_at_two(dtype):
+    """The Kolmogorov distance exceeds 2.23 / sqrt(n) with probability 1e-4 under the right law."""
+    n = 200_000
+    noise = truncated_normal((n,), seeded(), device=CPU, dtype=dtype)
+    assert noise.dtype == dtype
+    assert noise.abs().max() <= 2.0
+    exact = scipy.stats.truncnorm(-2.0, 2.0)
+    assert scipy.stats.kstest(noise.double().numpy(), exact.cdf).statistic < 2.23 / math.sqrt(n)
+    fourth = exact.moment(4)
+    standard_error = math.sqrt((fourth - exact.var() ** 2) / n)
+    assert noise.double().square().mean().item() == pytest.approx(exact.var(), abs=4 * standard_error)
+
+
+@pytest.mark.parametrize("uniform", [0.0, 0.5, 1.0 - 2.0**-24])
+def test_the_ends_of_the_uniform_draw_stay_finite(monkeypatch, uniform):
+    monkeypatch.setattr(torch, "rand", lambda shape, **kwargs: torch.full(shape, uniform))
+    noise = truncated_normal((1,), seeded(), device=CPU, dtype=torch.float32)
+    assert noise.item() == pytest.approx(scipy.stats.truncnorm.ppf(uniform, -2.0, 2.0), abs=1e-5)
+
+
+def test_every_plan_starts_from_a_quarter_of_the_range():
+    cem = CEM(**bounds([-3.0, 0.0], [3.0, 2.0]), horizon=2)
+    plan = cem.initial_plan()
+    assert torch.equal(plan.mean, torch.tensor([[0.0, 1.0]] * 2))
+    assert torch.equal(plan.std, torch.tensor([[1.5, 0.5]] * 2))
+    narrowed = Plan(torch.tensor([[1.0, 0.5], [2.0, 1.5]]), torch.full((2, 2), 1e-3))
+    assert torch.equal(cem.shift(narrowed, 1).std, plan.std)
+
+
+def test_the_recursion_is_the_one_computed_by_hand():
+    """Two iterations of K = 6, E = 2, a = 0.25, from a mean so near a bound that the cap on the std is active."""
+    cem = CEM(
+        **bounds([-1.0], [1.0], torch.float64), horizon=1, num_candidates=6, num_elites=2, num_iterations=2,
+        smoothing=0.25, min_std=0.0,
+    )  # fmt: skip
+    start = Plan(torch.tensor([[0.8]], dtype=torch.float64), torch.tensor([[0.5]], dtype=torch.float64))
+    seen = []
+
+    def objective(actions):
+        seen.append(actions.numpy().ravel())
+        return -actions[:, 0, 0].abs()
+
+    plan, info = cem.plan(objective, start, seeded(5))
+
+    generator, mean, variance = seeded(5), 0.8, 0.25
+    for candidates in seen:
+        std = min(math.sqrt(variance), (1.0 - mean) / 2, (mean + 1.0) / 2)
+        noise = truncated_normal((6, 1, 1), generator, device=CPU, dtype=torch.float64).numpy().ravel()
+        np.testing.assert_allclose(candidates, mean + std * noise, rtol=1e-14)
+        elites = sorted(candidates, key=abs)[:2]
+        mean = 0.25 * mean + 0.75 * (elites[0] + elites[1]) / 2
+        variance = 0.25 * variance + 0.75 * ((elites[0] - elites[1]) / 2) ** 2  # the variance of two, over n = 2
+    assert len(seen) == 2
+    assert plan.mean.item() == pytest.approx(mean, rel=1e-13)
+    assert plan.std.item() == pytest.approx(math.sqrt(variance), rel=1e-13)
+    assert info.expected_return == pytest.approx(-sum(map(abs, elites)) / 2, rel=1e-13)
+
+
+def test_fewer_finite_scores_than_elites_are_all_the_elites():
+    cem = CEM(**bounds([-1.0], [1.0]), horizon=2, num_candidates=20, num_elites=10, num_iterations=1, smoothing=0.0)
+    finite = torch.tensor([4, 11, 17])
+    seen = []
+
+    def objective(actions):
+        seen.append(actions)
+        return torch.full((20,), math.nan).index_fill(0, finite, -1e30)
+
+    plan, info = cem.plan(objective, cem.initial_plan(), seeded())
+    torch.testing.assert_close(plan.mean, seen[0][finite].mean(dim=0))
+    torch.testing.assert_close(plan.std, seen[0][finite].std(dim=0, correction=0))
+    assert info.num_nonfinite == 17
+    assert info.expected_return == pytest.approx(-1e30)
+
+
+@pytest.mark.parametrize(("min_std", "expected"), [(0.0, 5), (1.0, 1)])
+def test_it_stops_when_the_plan_is_narrow(min_std, expected):
+    cem = CEM(**bounds([-1.0], [1.0]), horizon=3, min_std=min_std)
+    _, info = cem.plan(lambda actions: actions.sum(dim=(1, 2)), cem.initial_plan(), seeded())
+    assert info.num_iterations == expected
+
+
+def test_plans_do_not_depend_on_the_units_of_the_action():
+    """A power of two scales floating-point numbers exactly."""
+    plans = []
+    for scale in (1.0, 2.0**-20):
+        cem = CEM(**bounds([-scale], [scale]), horizon=3, num_iterations=30)
+        plan, info = cem.plan(
+            lambda actions, scale=scale: -(actions / scale - 0.3).square().sum(dim=(1, 2)), cem.initial_plan(), seeded()
+        )
+        plans.append((plan.mean / scale, info.num_iterations))
+    assert torch.equal(plans[0][0], plans[1][0]) and plans[0][1] == plans[1][1] < 30
+
+
+class TestAgainstLQR:
+    """The excess over the optimal cost is e' G e for an error e of the plan, with G known.
+
+    The scale to compare it with is tr(G diag(std^2)), the expected excess of one candidate drawn around a perfect
+    mean: while it is smaller, what the plan lacks is less than what the search still explores. It grows beyond that
+    only if the search has narrowed before it arrived.
+    """
+
+    problem = lqr.LQR(
+        A=np.array([[1.0, 0.2], [-0.1, 0.95]]),
+        B=np.array([[0.0, 0.1], [0.3, 0.0]]),
+        Q=np.diag([1.0, 0.2]),
+        R=np.diag([0.1, 0.2]),
+    )
+    start = np.array([1.5, -0.5])
+    bound = 4.0  # twice the largest optimal action
+
+    def search(self, horizon, seed, **arguments):
+        A, B, Q, R = map(torch.tensor, self.problem)
+
+        def reward(observation, action, next_observation):
+            return -((next_observation @ Q) * next_observation).sum(-1) - ((action @ R) * action).sum(-1)
+
+        objective = rollout_objective(lambda x, u, step: x @ A.T + u @ B.T, reward, torch.tensor(self.start), 1)
+        actions, optimum = lqr.solve(self.problem, self.start, horizon)
+        assert np.abs(actions).max() < self.bound / 2
+        assert -objective(torch.tensor(actions)[None]).item() == pytest.approx(optimum, rel=1e-12)
+        cem = CEM(**bounds([-self.bound] * 2, [self.bound] * 2, torch.float64), horizon=horizon, **arguments)
+        plan, _ = cem.plan(objective, cem.initial_plan(), seeded(seed))
+        excess = -objective(plan.mean[None]).item() - optimum
+        explored = np.diag(lqr.condensed(self.problem, horizon)) @ plan.std.numpy().ravel() ** 2
+        assert excess > -1e-12 * optimum, "better than the optimum"
+        return excess, explored, optimum, objective
+
+    @pytest.mark.parametrize("seed", range(4))
+    def test_it_converges_to_the_optimum(self, seed):
+        excess, explored, optimum, _ = self.search(
+            5, seed, num_candidates=1000, num_elites=100, num_iterations=100, min_std=1e-3
+        )
+        assert excess < explored < 1e-4 * optimum
+
+    @pytest.mark.parametrize("seed", range(4))
+    def test_the_default_budget_comes_near_it(self, seed):
+        """20 dimensions in 5 iterations; the same number of sequences drawn uniformly does worse than doing nothing."""
+        excess, explored, optimum, objective = self.search(10, seed)
+        nothing = -objective(torch.zeros(1, 10, 2).double()).item() - optimum
+        uniform = (torch.rand(1500, 10, 2, generator=seeded(seed), dtype=torch.float64) * 2 - 1) * self.bound
+        assert -objective(uniform).max().item() - optimum > nothing
+        assert excess < explored
+        assert excess < 0.1 * nothing  # the largest of 100 seeds: 0.061
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"horizon": 0}, "horizon must be at least 1, got 0"),
+        ({"num_elites": 0}, "num_elites must be at least 1, got 0"),
+        ({"num_iterations": 0}, "num_iterations must be at least 1, got 0"),
+        ({"num_elites": 301}, "num_elites must not exceed num_candidates, got 301 of 300"),
+        ({"smoothing": 1.0}, r"smoothing must lie in \[0, 1\), got 1.0"),
+        ({"smoothing": math.nan}, r"smoothing must lie in \[0, 1\), got nan"),
+        ({"min_std": -0.1}, "min_std must not be negative, got -0.1"),
+        (bounds([1.0], [-1.0]), r"bounds must be finite.*got \[1.0\] and \[-1.0\]"),
+        (bounds([-1.0], [math.inf]), r"bounds must be finite.*inf"),
+        (bounds([math.nan], [1.0]), r"bounds must be finite.*nan"),
+        (bounds([-3.4e38], [3.4e38]), r"bounds must be finite.*e\+38"),
+        (bounds([], []), r"vectors of one length, got \(0,\) and \(0,\)"),
+        ({"action_low": torch.tensor([-1.0]).double()}, "one floating-point dtype, got .*float64, .*float32"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        CEM(**{**bounds([-1.0], [1.0]), "horizon": 3, **arguments})
