@@ -4,6 +4,7 @@ Used by `deep_gp.py` at the beginning of every fit.
 """
 
 import math
+import warnings
 
 import numpy as np
 import torch
@@ -46,10 +47,12 @@ def cluster(x: Float[Tensor, "N D"], num_clusters: int, generator: torch.Generat
         spread = 0.1 * torch.randn(len(extra), x.shape[1], generator=generator, dtype=x.dtype, device=x.device)
         return torch.cat([x, x[extra] + spread])
     seed = int(torch.randint(2**31, (), generator=generator, device=x.device))
-    # An empty cluster keeps its last centre, which is as good an inducing input as any.
-    centres, _ = kmeans2(
-        x.cpu().numpy(), num_clusters, iter=10, minit="points", missing="warn", rng=np.random.default_rng(seed)
-    )
+    with warnings.catch_warnings():
+        # An empty cluster keeps its last centre, which is as good an inducing input as any.
+        warnings.filterwarnings("ignore", "One of the clusters is empty", UserWarning)
+        centres, _ = kmeans2(
+            x.cpu().numpy(), num_clusters, iter=10, minit="points", missing="warn", rng=np.random.default_rng(seed)
+        )
     return torch.from_numpy(centres).to(x)
 
 
