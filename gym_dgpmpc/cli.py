@@ -1,0 +1,314 @@
+"""The command line: `dgpmpc train ENV_ID` and `dgpmpc evaluate PATH`.
+
+Says what is wrong in one line, with exit code 2. What is slow to import is imported when a command runs, so that
+`--help` answers at once.
+"""
+
+import importlib.metadata
+import inspect
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import gymnasium
+import typer
+
+import gym_dgpmpc  # noqa: F401  # registers the environments
+from gym_dgpmpc import options
+from gym_dgpmpc.errors import DGPMPCError
+
+if TYPE_CHECKING:
+    from gym_dgpmpc.reporting.run import TrainingRun
+
+EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
+DEFAULT_EPISODES = 15
+RUN = "Run"
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+
+def _show_version(value: bool) -> None:
+    if value:
+        typer.echo(f"dgpmpc {importlib.metadata.version('gym-dgpmpc')}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Sample-efficient model-predictive control with deep Gaussian processes."""
+
+
+@app.command()
+def train(
+    env_id: Annotated[
+        str, typer.Argument(metavar="ENV_ID", help="Gymnasium id of the environment, such as ModCartPole-v0.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the results. A run that it holds goes on after its last finished episode.",
+            show_default="runs/ENV_ID-seedSEED",
+            rich_help_panel=RUN,
+        ),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Begin anew where the folder holds a run.", rich_help_panel=RUN)
+    ] = False,
+    episodes: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Planned episodes; the random ones come before.",
+            show_default=str(DEFAULT_EPISODES),
+            rich_help_panel=RUN,
+        ),
+    ] = None,
+    timesteps: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Environment steps in all, the random ones too; instead of --episodes.", rich_help_panel=RUN
+        ),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Decides everything random, the environment included.", rich_help_panel=RUN)
+    ] = 0,
+    threads: Annotated[
+        int,
+        typer.Option(min=1, help="CPU threads. More than one helps only on idle cores.", rich_help_panel=RUN),
+    ] = 1,
+    progress: Annotated[
+        bool | None,
+        typer.Option(
+            "--progress/--no-progress", help="A progress bar.", show_default="on a terminal", rich_help_panel=RUN
+        ),
+    ] = None,
+    video: Annotated[
+        bool, typer.Option("--video/--no-video", help="A GIF of the last episode; needs OpenGL.", rich_help_panel=RUN)
+    ] = True,
+    num_layers: options.NumLayers = None,
+    kernel: options.Kernel = None,
+    num_inducing: options.NumInducing = None,
+    draw: options.Draw = None,
+    refresh: options.Refresh = None,
+    num_features: options.NumFeatures = None,
+    num_particles: options.NumParticles = None,
+    horizon: options.Horizon = None,
+    num_candidates: options.NumCandidates = None,
+    num_elites: options.NumElites = None,
+    num_iterations: options.NumIterations = None,
+    actions_per_plan: options.ActionsPerPlan = None,
+    learning_starts: options.LearningStarts = None,
+    first_training_iterations: options.FirstTraining = None,
+    training_iterations: options.Training = None,
+    resample_steps: options.Resample = None,
+) -> None:
+    """Train an agent, and leave results, pictures and the agent itself in a folder.
+
+    Options that are not given are as in the paper where it has the environment, else the agent's defaults.
+    """
+    asked = _plain(
+        num_layers=num_layers,
+        kernel=kernel,
+        num_inducing=num_inducing,
+        draw=draw,
+        refresh=refresh,
+        num_features=num_features,
+        num_particles=num_particles,
+        horizon=horizon,
+        num_candidates=num_candidates,
+        num_elites=num_elites,
+        num_iterations=num_iterations,
+        actions_per_plan=actions_per_plan,
+        learning_starts=learning_starts,
+        first_training_iterations=first_training_iterations,
+        training_iterations=training_iterations,
+        resample_steps=resample_steps,
+        seed=seed,
+    )
+    with _one_line_errors(ValueError, AssertionError, OSError):
+        if episodes is not None and timesteps is not None:
+            raise ValueError("give either --episodes or --timesteps, not both")
+        _use_threads(threads)
+        no_video = _prepare_video(env_id) if video else "--no-video was given"
+        env = _make(env_id, render=not no_video)
+        run = _set_up_run(env, asked, out, overwrite, episodes, timesteps)
+    if run.is_complete:
+        typer.echo(f"{run.folder.path} holds this run already, finished: ask for more --episodes, or --overwrite it")
+        return
+    if run.folder.goes_on:
+        typer.echo(f"{run.folder.path} goes on after step {run.agent.num_timesteps}")
+    started = time.perf_counter()
+    try:
+        with _one_line_errors():
+            run.train(progress_bar=os.isatty(1) if progress is None else progress)
+    except KeyboardInterrupt:
+        typer.echo(f"\ninterrupted; the same command goes on after the last finished episode in {run.folder.path}")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    _summarise(run, env_id, time.perf_counter() - started)
+    if video and no_video:
+        typer.echo(f"no GIF: {no_video}")
+    typer.echo(
+        f"next: dgpmpc evaluate {run.folder.path}; the same command with more --episodes learns on; "
+        f"tensorboard --logdir {run.folder.path} shows the logs"
+    )
+
+
+@app.command()
+def evaluate(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="A folder of `dgpmpc train`, or an agent's file.")],
+    env_id: Annotated[
+        str | None,
+        typer.Option(
+            "--env",
+            metavar="ENV_ID",
+            help="Gymnasium id of an environment of the same spaces.",
+            show_default="the one trained in",
+        ),
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes to play.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the environment's starting states.")] = 1000,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+    video: Annotated[
+        Path | None, typer.Option(metavar="FILE.gif", help="Write the last episode as a GIF; needs OpenGL.")
+    ] = None,
+) -> None:
+    """Play episodes with a trained agent, without learning, and report their returns."""
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    from gym_dgpmpc.agents import MPCAgent
+    from gym_dgpmpc.agents.checkpoint import read_checkpoint
+    from gym_dgpmpc.reporting.recording import Episode, EpisodeRecorder
+    from gym_dgpmpc.reporting.rendering import write_gif
+    from gym_dgpmpc.reporting.run import AGENT_FILE
+
+    returns: list[float] = []
+
+    def show(episode: Episode) -> None:
+        returns.append(float(episode.rewards.sum()))
+        typer.echo(f"episode {len(returns):3d} | {len(episode.rewards):6d} steps | return {returns[-1]:9.2f}")
+
+    with _one_line_errors(ValueError, AssertionError, OSError):
+        _use_threads(threads)
+        file = path / AGENT_FILE if path.is_dir() else path
+        env_id = env_id or read_checkpoint(file).config.get("environment")
+        if env_id is None:
+            raise ValueError(f"{file} does not say which environment it was trained in: give --env ENV_ID")
+        no_video = _prepare_video(env_id) if video else "not asked for"
+        recorder = EpisodeRecorder(_make(env_id, render=not no_video), show)
+        agent = MPCAgent.load(file, env=recorder)
+        env = agent.get_env()
+        assert env is not None
+        env.seed(seed)
+    with _one_line_errors():
+        evaluate_policy(agent, env, n_eval_episodes=episodes)
+    typer.echo(f"mean return {sum(returns) / len(returns):.2f}, from {min(returns):.2f} to {max(returns):.2f}")
+    if video is not None and no_video:
+        typer.echo(f"no GIF: {no_video}")
+    elif video is not None and recorder.last is not None:
+        write_gif(recorder.last.frames, video, recorder.last.frames_per_second)
+        typer.echo(f"last episode: {video}")
+
+
+@contextmanager
+def _one_line_errors(*expected: type[Exception]) -> Iterator[None]:
+    """Report this package's errors, Gymnasium's and the ``expected`` ones in one line; others are bugs."""
+    kinds: tuple[type[Exception], ...] = (DGPMPCError, gymnasium.error.Error, *expected)
+    try:
+        yield
+    except kinds as error:
+        typer.echo(f"error: {' '.join(str(error).split()) or type(error).__name__}", err=True)
+        raise typer.Exit(EXIT_ERROR) from error
+
+
+def _plain(**arguments: Any) -> dict[str, Any]:
+    """The arguments with choices as texts."""
+    return {name: value.value if isinstance(value, Enum) else value for name, value in arguments.items()}
+
+
+def _use_threads(threads: int) -> None:
+    import torch
+
+    torch.set_num_threads(threads)
+
+
+def _prepare_video(env_id: str) -> str:
+    """Choose MuJoCo's way to draw off-screen, before MuJoCo is used; the result says why there is none, if so."""
+    from gym_dgpmpc.reporting.rendering import probe_rendering
+
+    _make(env_id, render=False).close()  # so that a mistake in the id is not taken for a missing OpenGL
+    rendering = probe_rendering(env_id)
+    if rendering.mujoco_gl:
+        os.environ["MUJOCO_GL"] = rendering.mujoco_gl
+    return rendering.why_not
+
+
+def _make(env_id: str, *, render: bool) -> gymnasium.Env:
+    try:
+        return gymnasium.make(env_id, render_mode="rgb_array" if render else None)
+    except ModuleNotFoundError as error:
+        raise ValueError(f"the environment {env_id} needs the Python module {error.name}, which is missing") from error
+
+
+def _set_up_run(
+    env: gymnasium.Env,
+    asked: dict[str, Any],
+    out: Path | None,
+    overwrite: bool,
+    episodes: int | None,
+    timesteps: int | None,
+) -> "TrainingRun":
+    """The run that the options describe, with what they leave open filled in."""
+    from gym_dgpmpc.reporting.run import RunFolder, TrainingRun
+
+    assert env.spec is not None
+    env_id, max_steps = env.spec.id, env.spec.max_episode_steps
+    arguments = _fill_in(env_id, asked)
+    if timesteps is None:
+        if max_steps is None:
+            raise ValueError(f"episodes of {env_id} have no time limit and may never end: give --timesteps")
+        episodes = episodes or DEFAULT_EPISODES
+        timesteps = (arguments["learning_starts"] or max_steps) + episodes * max_steps
+    folder = RunFolder(
+        out or Path("runs") / f"{env_id}-seed{arguments['seed']}",
+        {"environment": env_id, **arguments},
+        overwrite=overwrite,
+    )
+    run = TrainingRun(folder, env, arguments, num_episodes=episodes, total_timesteps=timesteps)
+    folder.write_settings(episodes=episodes, timesteps=timesteps)
+    return run
+
+
+def _fill_in(env_id: str, asked: dict[str, Any]) -> dict[str, Any]:
+    """Every argument as asked, else as in the paper's preset for the environment, else as the agent has it."""
+    from gym_dgpmpc.agents import DGPMPCAgent
+    from gym_dgpmpc.agents.presets import PAPER
+
+    parameters = inspect.signature(DGPMPCAgent).parameters
+    filled = {name: parameters[name].default for name in asked}
+    filled |= PAPER.get(env_id, {})
+    if asked["num_candidates"] is not None:
+        filled["num_elites"] = None  # the preset's elites are a part of the preset's candidates
+    return filled | {name: value for name, value in asked.items() if value is not None}
+
+
+def _summarise(run: "TrainingRun", env_id: str, seconds: float) -> None:
+    """Draw the figures, and say how it went and where everything is."""
+    agent, folder = run.agent, run.folder
+    figures = run.write_figures(f"{env_id}, L = {agent.num_layers}, {agent.kernel}, seed {agent.seed}")
+    planned = [row.episode_return for row in folder.rows() if row.actions == "planned"]
+    typer.echo(f"\n{agent.num_timesteps} environment steps; this command took {seconds / 60:.1f} minutes")
+    if planned:
+        mean, best = sum(planned) / len(planned), max(planned)
+        typer.echo(
+            f"return of {len(planned)} planned episodes: mean {mean:.2f}, best {best:.2f}, last {planned[-1]:.2f}"
+        )
+    for file in [*figures, folder.agent_file, folder.episodes_file]:
+        typer.echo(f"  {file}")
