@@ -1,0 +1,225 @@
+"""What holds for every module: layers, documentation, length, and what must not be imported or called."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "gym_dgpmpc"
+MODULES = {
+    "gym_dgpmpc." + ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for path in PACKAGE.rglob("*.py")
+}
+
+LAYERS = (
+    {"types", "errors"},
+    {"envs", "wrappers"},
+    {"data"},
+    {"gp"},
+    {"inference"},
+    {"dynamics"},
+    {"planning"},
+    {"agents"},
+    {"reporting"},
+    {"__init__"},
+    {"options", "cli"},
+    {"__main__"},
+)
+"""Each layer imports only from itself and from those above it. The public names stand below all that they name."""
+
+MAX_LINES = 350
+
+NEWER_THAN_PYTHON_3_10 = {
+    "asyncio": {"Runner", "TaskGroup", "timeout"},
+    "contextlib": {"chdir"},
+    "datetime": {"UTC"},
+    "enum": {"StrEnum", "ReprEnum", "member", "nonmember", "verify"},
+    "itertools": {"batched"},
+    "tomllib": {"load", "loads"},
+    "typing": {
+        "LiteralString",
+        "Never",
+        "NotRequired",
+        "ReadOnly",
+        "Required",
+        "Self",
+        "TypeAliasType",
+        "TypeIs",
+        "TypeVarTuple",
+        "Unpack",
+        "assert_never",
+        "assert_type",
+        "dataclass_transform",
+        "override",
+        "reveal_type",
+    },
+}
+
+RUNS_CODE_FROM_FILES = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
+RUNS_CODE_FROM_FILES |= {"stable_baselines3.common.save_util", "torch.load", "torch.save"}
+
+GLOBAL_RANDOMNESS = {"random", "torch.distributions", "torch.manual_seed", "torch.seed", "torch.random"}
+TORCH_RANDOM = {
+    f"torch.{name}"
+    for name in (
+        "bernoulli", "multinomial", "normal", "poisson", "rand", "rand_like", "randint", "randint_like", "randn",
+        "randn_like", "randperm", "_standard_gamma", "binomial",
+    )
+}  # fmt: skip
+TENSOR_RANDOM = {
+    "bernoulli_", "cauchy_", "exponential_", "geometric_", "log_normal_", "normal_", "random_", "uniform_",
+}  # fmt: skip
+
+
+def imports(tree: ast.AST) -> set[str]:
+    """Dotted names of everything that is imported, wherever in the module: `from a import b` gives a and a.b."""
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def layer_of(name: str) -> int:
+    """The layer of a dotted name of this package: "gym_dgpmpc.gp.kernels" is in that of gp."""
+    part = name.split(".")[1] if "." in name else "__init__"
+    for i, layer in enumerate(LAYERS):
+        if part in layer:
+            return i
+    return LAYERS.index({"__init__"})  # a public name
+
+
+def upward_imports(module: str, tree: ast.AST) -> list[str]:
+    """Imports from a layer below the module's own."""
+    names = {name for name in imports(tree) if name.split(".")[0] == "gym_dgpmpc"}
+    # `from gym_dgpmpc import types` names the package itself too, but takes only the module from it.
+    names -= {"gym_dgpmpc"} if any(name.count(".") == 1 and name in MODULES for name in names) else set()
+    return sorted(name for name in names if layer_of(name) > layer_of(module))
+
+
+def dotted(node: ast.AST) -> str:
+    """ "torch.randn" for the expression torch.randn; "" for what is no dotted name."""
+    if isinstance(node, ast.Name):
+        return node.id
+    if isinstance(node, ast.Attribute) and dotted(node.value):
+        return f"{dotted(node.value)}.{node.attr}"
+    return ""
+
+
+def unseeded_calls(tree: ast.AST) -> list[str]:
+    """Calls that draw from PyTorch's or NumPy's global random state."""
+    found = []
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        name = dotted(node.func)
+        method = node.func.attr if isinstance(node.func, ast.Attribute) else ""
+        # Of f(**options) one cannot tell, so it passes.
+        has_generator = any(keyword.arg in ("generator", None) for keyword in node.keywords)
+        legacy_numpy = name.startswith(("np.random.", "numpy.random.")) and name.rsplit(".")[-1].islower()
+        legacy_numpy = legacy_numpy and not name.endswith("default_rng")
+        if legacy_numpy or ((name in TORCH_RANDOM or method in TENSOR_RANDOM) and not has_generator):
+            found.append(f"line {node.lineno}: {name or method}")
+    return found
+
+
+def forbidden(tree: ast.AST, names: set[str]) -> list[str]:
+    """Imports and uses of the names, or of what is in them."""
+    used = imports(tree) | {dotted(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    return sorted(name for name in used if any(name == bad or name.startswith(f"{bad}.") for bad in names))
+
+
+def too_new(tree: ast.AST) -> list[str]:
+    """Names of the standard library that Python 3.10 does not have."""
+    newer = {f"{module}.{name}" for module, names in NEWER_THAN_PYTHON_3_10.items() for name in names}
+    return forbidden(tree, newer)
+
+
+@pytest.fixture(params=sorted(MODULES))
+def module(request):
+    return request.param
+
+
+@pytest.fixture
+def source(module):
+    return MODULES[module].read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def tree(source):
+    return ast.parse(source, feature_version=(3, 10))
+
+
+def test_every_package_has_a_layer():
+    known = set().union(*LAYERS)
+    assert {name.split(".")[1] for name in MODULES} <= known
+
+
+def test_imports_only_from_above(module, tree):
+    assert upward_imports(module, tree) == []
+
+
+def test_says_what_it_is(tree):
+    assert ast.get_docstring(tree)
+
+
+def test_can_be_read_at_once(source):
+    assert len(source.splitlines()) <= MAX_LINES
+
+
+def test_runs_no_code_from_files(tree):
+    assert forbidden(tree, RUNS_CODE_FROM_FILES) == []
+
+
+def test_randomness_is_an_argument(tree):
+    assert unseeded_calls(tree) == []
+    assert forbidden(tree, GLOBAL_RANDOMNESS) == []
+
+
+def test_needs_no_newer_python(tree):
+    assert too_new(tree) == []
+
+
+@pytest.mark.parametrize(
+    ("module_name", "line", "found"),
+    [
+        ("gym_dgpmpc.gp.layer", "from gym_dgpmpc.gp.kernels import Kernel", []),
+        ("gym_dgpmpc.gp.layer", "from gym_dgpmpc import types", []),
+        ("gym_dgpmpc.gp.layer", "import gym_dgpmpc.agents.mpc", ["gym_dgpmpc.agents.mpc"]),
+        ("gym_dgpmpc.gp.layer", "def f():\n    from gym_dgpmpc import cli", ["gym_dgpmpc.cli"]),
+        ("gym_dgpmpc.agents.mpc", "from gym_dgpmpc import PETSAgent", ["gym_dgpmpc", "gym_dgpmpc.PETSAgent"]),
+        ("gym_dgpmpc.types", "import gym_dgpmpc", ["gym_dgpmpc"]),
+    ],
+)
+def test_upward_imports_are_found(module_name, line, found):
+    assert upward_imports(module_name, ast.parse(line)) == found
+
+
+@pytest.mark.parametrize(
+    ("line", "count"),
+    [
+        ("torch.randn(3, generator=g)", 0),
+        ("x.normal_(generator=g)", 0),
+        ("np.random.default_rng(0)", 0),
+        ("np.random.SeedSequence(0)", 0),
+        ("torch.randn(3)", 1),
+        ("f(x)[0].normal_()", 1),
+        ("np.random.normal()", 1),
+    ],
+)
+def test_unseeded_calls_are_found(line, count):
+    assert len(unseeded_calls(ast.parse(line))) == count
+
+
+@pytest.mark.parametrize("line", ["import pickle", "from torch import load", "torch.load(f)", "import joblib.memory"])
+def test_code_from_files_is_found(line):
+    assert forbidden(ast.parse(line), RUNS_CODE_FROM_FILES)
+
+
+@pytest.mark.parametrize(
+    "line", ["from typing import Self", "import typing\nx: typing.Self", "import tomllib\ntomllib.load(f)"]
+)
+def test_newer_names_are_found(line):
+    assert too_new(ast.parse(line))
