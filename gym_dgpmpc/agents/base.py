@@ -268,20 +268,13 @@ class PlanningAgent(BaseAlgorithm):
         """The learned state of the dynamics model, by SB3's name for such things."""
         return {"dynamics": self.dynamics.state_dict()}
 
-    def set_parameters(
-        self,
-        load_path_or_dict: Any,
-        exact_match: bool = True,
-        device: torch.device | str = "auto",
-    ) -> None:
-        """Take over what `get_parameters` of an agent of the same arguments returned. For a file use `load`.
+    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+        """Not offered, because SB3's own would unpickle the file: use `load`.
 
         Raises:
-            ValueError: it is something else.
+            NotImplementedError: always.
         """
-        if not isinstance(load_path_or_dict, dict) or set(load_path_or_dict) != {"dynamics"}:
-            raise ValueError(f"expected what get_parameters returns, got {load_path_or_dict!r}; for a file use load")
-        self.dynamics.load_state_dict(load_path_or_dict["dynamics"])
+        raise NotImplementedError(f"to take over what another agent has learned use {type(self).__name__}.load(path)")
 
     def _find_task(self) -> Task:
         both_spaces = self.observation_space, self.action_space

@@ -13,7 +13,7 @@ TIME_STEP = 0.3
 
 
 def reward_fn(observation, action, next_observation):
-    return -next_observation[..., 0] ** 2 - 0.01 * action[..., 0] ** 2
+    return -(next_observation[..., 0] ** 2) - 0.01 * action[..., 0] ** 2
 
 
 class PointMass(gym.Env):

@@ -69,7 +69,7 @@ def test_one_environment_in_a_vec_env(vec_env_cls):
 
 
 def test_an_unknown_reward_says_what_to_pass():
-    with pytest.raises(UnknownRewardError, match="PointMass.*reward_fn=.*S = 2, A = 1"):
+    with pytest.raises(UnknownRewardError, match=r"PointMass.*reward_fn=.*S = 2, A = 1"):
         agent(PointMass())
     learner = agent(PointMass(), reward_fn=reward_fn).learn(12)
     assert learner.task.reward_fn is reward_fn

@@ -14,7 +14,7 @@ def test_it_learns_the_point_mass_from_one_random_episode():
     learner.learn(4 * LENGTH)
     returns = learner.store.rewards.reshape(4, LENGTH).sum(1)
     assert (returns[1:] > -4.0).all()
-    optimal_start = -(1.0 + 0.3 * 0.3 * -2.0) ** 2
+    optimal_start = -((1.0 + 0.3 * 0.3 * -2.0) ** 2)
     assert learner.store.rewards[LENGTH] >= optimal_start - 0.2
 
 
@@ -71,14 +71,14 @@ def test_training_also_follows_an_episode_that_ends_the_call_and_is_not_repeated
 
 
 def test_the_first_episode_is_uniformly_random():
-    learner = agent(learning_starts=2000)
-    learner.learn(2000)
+    learner = agent(learning_starts=1000)
+    learner.learn(1000)
     actions = actions_of(learner.env.envs[0])
-    assert learner.dynamics.fits == [2000]
+    assert learner.dynamics.fits == [1000]
     assert np.all(np.abs(actions) <= 2.0)
-    # The variance of a uniform variable of width 4 is 16 / 12; standard errors are 0.026 and 0.027.
-    assert abs(actions.mean()) < 0.12
-    assert abs(actions.var() - 16 / 12) < 0.12
+    # The variance of a uniform variable of width 4 is 16 / 12; standard errors are 0.037 and 0.038.
+    assert abs(actions.mean()) < 0.16
+    assert abs(actions.var() - 16 / 12) < 0.16
 
 
 @pytest.mark.parametrize(("learning_starts", "first_fit"), [(None, 10), (4, 4), (13, 13)])
@@ -188,7 +188,7 @@ def test_a_reset_that_is_not_finite():
     learner.learn(15)
     reset = env.reset
     env.reset = lambda **kwargs: (np.array([np.nan, 0.0]), {})
-    with pytest.raises(EnvironmentDataError, match="after 20 steps.*reset.*nan"):
+    with pytest.raises(EnvironmentDataError, match=r"after 20 steps.*reset.*nan"):
         learner.learn(15, reset_num_timesteps=False)
     assert len(learner.store) == 20
     env.reset = reset

@@ -1,0 +1,364 @@
+"""Saved agents: nothing is lost, learning goes on as if it had not stopped, and only named errors come of bad files."""
+
+import io
+import json
+import os
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from gym_dgpmpc import MPCAgent
+from gym_dgpmpc.agents import checkpoint
+from gym_dgpmpc.agents.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from gym_dgpmpc.errors import CheckpointError, UnknownRewardError
+from tests.agents.point_mass import (
+    LENGTH,
+    KnownPointMass,
+    LinearModel,
+    PointMass,
+    actions_of,
+    agent,
+    planner,
+    reward_fn,
+)
+
+OBSERVATIONS = np.random.default_rng(0).normal(size=(4, 2))
+
+
+def load(path, env=None, **arguments):
+    env = KnownPointMass(fixed_start=True) if env is None else env
+    return MPCAgent.load(path, env=env, dynamics=LinearModel(), planner=planner(), **arguments)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    path = tmp_path_factory.mktemp("saved") / "agent.zip"
+    agent(KnownPointMass(fixed_start=True), actions_per_plan=2).learn(25).save(path)
+    return path
+
+
+def test_the_loaded_agent_is_the_saved_one(tmp_path):
+    learned = agent(actions_per_plan=2, num_particles=3).learn(25)
+    learned.save(tmp_path / "agent")
+    loaded = load(tmp_path / "agent")
+    assert (loaded.num_timesteps, loaded._episode_num, loaded.num_particles) == (25, 2, 3)
+    for one, other in zip(learned.store.state_dict().values(), loaded.store.state_dict().values(), strict=True):
+        assert torch.equal(one, other)
+    for deterministic in (True, False):
+        state, other_state = None, None
+        for observation in OBSERVATIONS:
+            action, state = learned.predict(observation, state, deterministic=deterministic)
+            other, other_state = loaded.predict(observation, other_state, deterministic=deterministic)
+            np.testing.assert_array_equal(action, other)
+
+
+@pytest.mark.parametrize("stop", [LENGTH // 2, LENGTH, 3 * LENGTH])
+def test_learning_goes_on_as_if_it_had_not_stopped(stop, tmp_path):
+    """From an episode's start, and, in an environment that still runs, from its middle."""
+    whole = agent(KnownPointMass(fixed_start=True))
+    whole.learn(5 * LENGTH)
+    part = agent(KnownPointMass(fixed_start=True))
+    part.learn(stop)
+    part.save(tmp_path / "part")
+    loaded = load(tmp_path / "part", env=part.env, force_reset=stop % LENGTH == 0)
+    loaded.learn(5 * LENGTH - stop, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 5 * LENGTH
+    np.testing.assert_array_equal(actions_of(whole.env.envs[0]), actions_of(loaded.env.envs[0]))
+
+
+def test_a_checkpoint_from_a_callback_goes_on_too(tmp_path):
+    whole = agent(KnownPointMass(fixed_start=True))
+    whole.learn(40, callback=lambda locals_, _: whole.num_timesteps != 20 or whole.save(tmp_path / "at_20") is None)
+    loaded = load(tmp_path / "at_20")
+    assert loaded.num_fitted == 10
+    loaded.learn(20, reset_num_timesteps=False)
+    np.testing.assert_array_equal(actions_of(whole.env.envs[0])[20:], actions_of(loaded.env.envs[0]))
+
+
+def test_an_environment_is_not_seeded_twice_with_the_same_number(tmp_path):
+    learned = agent(KnownPointMass()).learn(2 * LENGTH)
+    learned.save(tmp_path / "agent")
+    starts = []
+    for _ in range(2):
+        loaded = load(tmp_path / "agent", env=KnownPointMass()).learn(LENGTH, reset_num_timesteps=False)
+        starts.append(loaded.store.transitions().observation[2 * LENGTH].tolist())
+    first = learned.store.transitions().observation[[0, LENGTH]].tolist()
+    assert starts[0] == starts[1]
+    assert starts[0] not in first
+
+
+def test_an_untrained_agent_and_one_before_its_first_training(tmp_path):
+    agent().save(tmp_path / "fresh")
+    loaded = load(tmp_path / "fresh")
+    assert not loaded.is_fitted
+    loaded.learn(4).save(tmp_path / "exploring")
+    assert load(tmp_path / "exploring").learn(8, reset_num_timesteps=False).dynamics.fits == []
+
+
+@pytest.mark.parametrize("name", ["agent", "agent.zip", "folder/new/agent_20_steps.zip", "agent.v1"])
+def test_paths_are_sb3s(name, tmp_path):
+    agent().learn(12).save(str(tmp_path / name))
+    written = [path for path in tmp_path.rglob("*") if path.is_file()]
+    expected = tmp_path / (name if "." in name else f"{name}.zip")
+    assert written == [expected]
+    assert load(str(tmp_path / name)).num_timesteps == load(expected).num_timesteps == 12
+
+
+def test_file_objects():
+    buffer = io.BytesIO()
+    agent().learn(12).save(buffer)
+    assert load(buffer).num_timesteps == 12
+
+
+def test_the_same_agent_gives_the_same_bytes(tmp_path):
+    for name in ("one", "other"):
+        agent(tensorboard_log=None).learn(9).save(tmp_path / name)
+    one, other = (read_checkpoint(tmp_path / name) for name in ("one", "other"))
+    for config in (one.config, other.config):
+        for info in config["episode_infos"]:
+            info.pop("t")
+    assert one.config == other.config
+    assert all(torch.equal(one.tensors[p][n], other.tensors[p][n]) for p in one.tensors for n in one.tensors[p])
+
+
+def test_rewards_that_were_given_are_given_again(tmp_path):
+    agent(PointMass(), reward_fn=reward_fn).learn(12).save(tmp_path / "agent")
+    with pytest.raises(UnknownRewardError, match="reward_fn="):
+        load(tmp_path / "agent", env=PointMass())
+    assert load(tmp_path / "agent", env=PointMass(), reward_fn=reward_fn).task.reward_fn is reward_fn
+
+
+def test_without_an_environment_an_agent_predicts_if_it_is_given_the_reward(saved):
+    parts = {"dynamics": LinearModel(), "planner": planner()}
+    with pytest.raises(UnknownRewardError, match="no environment"):
+        MPCAgent.load(saved, **parts).predict(OBSERVATIONS[0])
+    alone = MPCAgent.load(saved, reward_fn=reward_fn, **parts)
+    expected = load(saved).predict(OBSERVATIONS[0], deterministic=True)[0]
+    np.testing.assert_array_equal(alone.predict(OBSERVATIONS[0], deterministic=True)[0], expected)
+    later = MPCAgent.load(saved, **parts)
+    later.set_env(KnownPointMass())
+    np.testing.assert_array_equal(later.predict(OBSERVATIONS[0], deterministic=True)[0], expected)
+
+
+def test_arguments_can_be_replaced(saved):
+    other = load(saved, num_particles=9, verbose=0)
+    assert other.num_particles == 9
+    assert load(saved).num_particles == 5
+    reseeded = load(saved, seed=77)
+    assert reseeded.seed == 77
+    assert not torch.equal(reseeded.generators.planning.get_state(), load(saved).generators.planning.get_state())
+    with pytest.raises(CheckpointError, match="no_such_argument"):
+        load(saved, no_such_argument=1)
+
+
+def test_other_spaces_are_named(saved):
+    env = KnownPointMass()
+    env.action_space = spaces.Box(-3.0, 3.0, (1,), np.float32)
+    with pytest.raises(CheckpointError, match=r"actions Box\(-2.0, 2.0.*has .*Box\(-3.0, 3.0"):
+        load(saved, env=env)
+
+
+def test_a_missing_file_is_a_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load(tmp_path / "nothing")
+    with pytest.raises(CheckpointError, match="is a folder"):
+        load(tmp_path)
+
+
+def members_of(path):
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def zipped(path, members, **options):
+    with zipfile.ZipFile(path, "w", **options) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return path
+
+
+def changed(saved, path, change):
+    """The saved file with its config edited, checksums right."""
+    config, tensors = read_checkpoint(saved)
+    change(config, tensors)
+    write_checkpoint(Checkpoint(config, tensors), path)
+    return path
+
+
+def test_no_pickle_is_inside(saved):
+    assert sorted(members_of(saved)) == [
+        "agent.safetensors", "config.json", "dynamics.safetensors", "generators.safetensors", "manifest.json",
+        "transitions.safetensors",
+    ]  # fmt: skip
+
+
+class Bomb:
+    def __reduce__(self):
+        return os.putenv, ("THE_FILE_RAN_CODE", "1")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "not a checkpoint"),
+        (b"nonsense", "not a checkpoint"),
+        (pickle.dumps(Bomb()), "not a checkpoint"),
+        (b"PK\x03\x04" + bytes(100), "not a checkpoint"),
+    ],
+)
+def test_files_that_are_not_ours(content, message, tmp_path, monkeypatch):
+    monkeypatch.setattr(pickle, "loads", None)
+    monkeypatch.setattr(torch, "load", None)
+    (tmp_path / "file.zip").write_bytes(content)
+    with pytest.raises(CheckpointError, match=f"file.zip is {message}"):
+        load(tmp_path / "file.zip")
+
+
+def test_an_sb3_file_is_refused_without_being_unpickled(tmp_path):
+    zipped(
+        tmp_path / "sb3.zip", {"data": b"{}", "policy.pth": pickle.dumps(Bomb()), "_stable_baselines3_version": b"2"}
+    )
+    with pytest.raises(CheckpointError, match=r"no manifest.json"):
+        load(tmp_path / "sb3.zip")
+
+
+def test_every_truncation_is_an_error(saved, tmp_path):
+    data = saved.read_bytes()
+    for length in sorted({*range(0, len(data), len(data) // 60), *range(len(data) - 40, len(data), 3)}):
+        (tmp_path / "cut.zip").write_bytes(data[:length])
+        with pytest.raises(CheckpointError):
+            load(tmp_path / "cut.zip")
+
+
+def test_every_flipped_byte_is_an_error_or_harmless(saved, tmp_path):
+    data = bytearray(saved.read_bytes())
+    expected = load(saved).predict(OBSERVATIONS[0], deterministic=True)[0]
+    for place in np.random.default_rng(1).integers(0, len(data), 60):
+        damaged = data.copy()
+        damaged[place] ^= 0x55
+        (tmp_path / "flipped.zip").write_bytes(damaged)
+        try:
+            loaded = load(tmp_path / "flipped.zip")
+        except CheckpointError:
+            continue
+        np.testing.assert_array_equal(loaded.predict(OBSERVATIONS[0], deterministic=True)[0], expected)
+
+
+def test_a_checksum_that_does_not_match_names_the_member(saved, tmp_path):
+    members = members_of(saved)
+    members["dynamics.safetensors"] = members["dynamics.safetensors"][:-1] + b"\0"
+    with pytest.raises(CheckpointError, match=r"checksum of 'dynamics.safetensors'"):
+        load(zipped(tmp_path / "file.zip", members))
+
+
+def test_a_newer_schema_says_what_to_do(saved, tmp_path):
+    members = members_of(saved)
+    manifest = json.loads(members["manifest.json"])
+    members["manifest.json"] = json.dumps(manifest | {"schema": 99}).encode()
+    with pytest.raises(CheckpointError, match=r"schema 99.*reads up to 1.*version that wrote it"):
+        load(zipped(tmp_path / "file.zip", members))
+    members["manifest.json"] = json.dumps(manifest | {"format": "something else"}).encode()
+    with pytest.raises(CheckpointError, match="its format is 'something else'"):
+        load(zipped(tmp_path / "file.zip", members))
+    members["manifest.json"] = b"[" * 100_000
+    with pytest.raises(CheckpointError, match="damaged"):
+        load(zipped(tmp_path / "file.zip", members))
+    members["manifest.json"] = b"[]"
+    with pytest.raises(CheckpointError, match="not an object"):
+        load(zipped(tmp_path / "file.zip", members))
+
+
+def test_compressed_additional_and_repeated_members(saved, tmp_path):
+    members = members_of(saved)
+    with pytest.raises(CheckpointError, match="compressed"):
+        load(zipped(tmp_path / "bomb.zip", members, compression=zipfile.ZIP_DEFLATED))
+    with pytest.raises(CheckpointError, match="not those of its manifest"):
+        load(zipped(tmp_path / "more.zip", {**members, "../../evil.py": b"1"}))
+    with zipfile.ZipFile(tmp_path / "more.zip", "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr("config.json", b"{}")
+    with pytest.raises(CheckpointError, match="repeated"):
+        load(tmp_path / "more.zip")
+
+
+def test_sizes_are_bounded(saved, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoint, "MAX_JSON_BYTES", 100)
+    with pytest.raises(CheckpointError, match=r"'config.json' is compressed or larger"):
+        load(saved)
+    monkeypatch.setattr(checkpoint, "MAX_FILE_BYTES", 100)
+    with pytest.raises(CheckpointError, match="more than a checkpoint may have"):
+        load(saved)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c, t: c.update({"class": "os.system"}), "class 'os.system'"),
+        (lambda c, t: c.update({"class": ["MPCAgent"]}), "class"),
+        (lambda c, t: c.pop("class"), "class None"),
+        (lambda c, t: c["arguments"].pop("seed"), "arguments are not those"),
+        (lambda c, t: c["arguments"].update(env="evil:Env-v0"), "arguments are not those"),
+        (lambda c, t: c["arguments"].update(num_particles="many"), "no MPCAgent can be made"),
+        (lambda c, t: c["arguments"].update(num_particles=10**12), "num_particles = 1000000000000 is larger"),
+        (lambda c, t: c["arguments"].update(num_particles=float("nan")), "num_particles = nan"),
+        (lambda c, t: c["arguments"].update(seed=-3), "no MPCAgent can be made"),
+        (lambda c, t: c["arguments"].update(verbose={"a": 1}), "argument that cannot be read"),
+        (lambda c, t: c.pop("arguments"), "arguments are not those"),
+        (lambda c, t: c.pop("counters"), "does not fit"),
+        (lambda c, t: c["counters"].update(num_timesteps="x"), "does not fit"),
+        (lambda c, t: c.update(values=3), "does not fit"),
+        (lambda c, t: t.pop("dynamics"), "does not fit"),
+        (lambda c, t: t["transitions"].pop("reward"), "fields"),
+        (lambda c, t: t["transitions"].update(action=torch.zeros(25, 3)), "action"),
+        (lambda c, t: t["transitions"]["observation"].fill_(torch.nan), "finite"),
+        (lambda c, t: t["generators"].update(fit=torch.zeros(3, dtype=torch.uint8)), "does not fit"),
+        (lambda c, t: t["agent"].pop("plan.mean"), "does not fit"),
+        (lambda c, t: t["agent"].update({"plan.age": torch.tensor([7])}), "does not fit"),
+        (lambda c, t: t["agent"].pop("action_space.low"), "does not describe the spaces"),
+        (lambda c, t: c["space_dtypes"].update(action_space="object"), "spaces"),
+        (lambda c, t: t["agent"].update({"action_space.low": torch.zeros(2)}), "spaces"),
+    ],
+)
+def test_contents_that_do_not_fit_are_named(change, message, saved, tmp_path):
+    with pytest.raises(CheckpointError, match=message):
+        load(changed(saved, tmp_path / "changed.zip", change))
+
+
+def test_classes_are_checked(saved, tmp_path):
+    from gym_dgpmpc import DGPMPCAgent
+
+    with pytest.raises(CheckpointError, match=r"MPCAgent.load, not DGPMPCAgent.load"):
+        DGPMPCAgent.load(saved)
+
+    class Mine(MPCAgent):
+        pass
+
+    Mine(KnownPointMass(), LinearModel(), planner()).save(tmp_path / "mine")
+    with pytest.raises(CheckpointError, match="class 'Mine'"):
+        load(tmp_path / "mine")
+    assert isinstance(Mine.load(tmp_path / "mine", KnownPointMass(), dynamics=LinearModel(), planner=planner()), Mine)
+
+
+@pytest.mark.parametrize("failing", ["fsync", "replace"])
+def test_a_failed_write_leaves_the_old_file_whole(failing, tmp_path, monkeypatch):
+    agent().learn(12).save(tmp_path / "agent")
+    before = (tmp_path / "agent.zip").read_bytes()
+    longer = agent().learn(15)
+
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, failing, full)
+    with pytest.raises(OSError, match="No space left"):
+        longer.save(tmp_path / "agent")
+    assert [path.name for path in tmp_path.iterdir()] == ["agent.zip"]
+    assert (tmp_path / "agent.zip").read_bytes() == before
+
+
+def test_permissions_are_those_of_any_new_file(tmp_path):
+    agent().save(tmp_path / "agent")
+    (tmp_path / "other").write_bytes(b"")
+    assert (tmp_path / "agent.zip").stat().st_mode == (tmp_path / "other").stat().st_mode
