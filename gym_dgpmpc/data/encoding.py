@@ -41,6 +41,8 @@ class Encoder:
             raise ValueError(f"nothing is left to predict: all {observation_size} dimensions are constant in {spec}")
         self.input_size = len(self.plain) + 2 * len(self.angles) + action_size
         self.target_size = len(self.predicted)
+        if not self.input_size:
+            raise ValueError(f"nothing is left to feed: there is no action, and not_inputs holds all dimensions in {spec}")
         self._is_change = torch.tensor([i not in spec.absolute for i in self.predicted])
         self._wraps = torch.tensor([i in spec.angles and i not in spec.absolute for i in self.predicted])
 
@@ -57,10 +59,10 @@ class Encoder:
     ) -> Float[Tensor, "*b T"]:
         """What the model predicts: the change (of an angle: the smaller way round), or the value if absolute."""
         before, after = observation[..., self.predicted], next_observation[..., self.predicted]
-        target = torch.where(self._is_change, after - before, after)
+        target = torch.where(self._is_change.to(after.device), after - before, after)
         if bool(self._wraps.any()):
             turn = 2 * math.pi
-            target = torch.where(self._wraps, target - turn * torch.round(target / turn), target)
+            target = torch.where(self._wraps.to(after.device), target - turn * torch.round(target / turn), target)
         return target
 
     def next_observation(
