@@ -1,0 +1,122 @@
+"""What the model reads and predicts, and the way back to the next observation."""
+
+import math
+
+import hypothesis.strategies as st
+import pytest
+import torch
+from hypothesis import given, settings
+
+from gym_dgpmpc.data.encoding import Encoder
+from gym_dgpmpc.types import ObservationSpec
+from tests.oracles.models import normal, seeded
+
+CARTPOLE = ObservationSpec(angles=(1,))
+
+
+def test_the_cart_pole_has_the_layout_of_pets():
+    encoder = Encoder(4, 1, CARTPOLE)
+    assert (encoder.input_size, encoder.target_size) == (6, 4)
+    observation, action = torch.tensor([[1.0, 0.5, 2.0, 3.0]]), torch.tensor([[-4.0]])
+    expected = torch.tensor([[1.0, 2.0, 3.0, math.sin(0.5), math.cos(0.5), -4.0]])
+    torch.testing.assert_close(encoder.inputs(observation, action), expected)
+    after = observation + torch.tensor([[0.1, 0.2, 0.3, 0.4]])
+    torch.testing.assert_close(encoder.targets(observation, after), torch.tensor([[0.1, 0.2, 0.3, 0.4]]))
+
+
+def test_every_kind_of_dimension_at_once():
+    """A velocity that is predicted itself and not fed, an angle, a goal that is fed but fixed, a plain number."""
+    encoder = Encoder(4, 2, ObservationSpec(angles=(1,), absolute=(0,), not_inputs=(0,), constant=(2,)))
+    assert (encoder.input_size, encoder.target_size) == (2 + 2 + 2, 3)
+    observation = torch.tensor([9.0, 0.25, 5.0, 7.0], dtype=torch.float64)
+    after = torch.tensor([8.0, 0.5, -1.0, 7.5], dtype=torch.float64)
+    inputs = encoder.inputs(observation, torch.tensor([1.0, 2.0], dtype=torch.float64))
+    assert inputs.tolist() == [5.0, 7.0, math.sin(0.25), math.cos(0.25), 1.0, 2.0]
+    target = encoder.targets(observation, after)
+    assert target.tolist() == [8.0, 0.25, 0.5]
+    assert encoder.next_observation(observation, target).tolist() == [8.0, 0.5, 5.0, 7.5]
+    assert observation[0] == 9.0, "the argument is left alone"
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [(3.1, -3.1), (-3.1, 3.1), (0.1, 2 * math.pi - 0.1), (40.0, 3.0), (0.0, 3.0)]
+)
+def test_the_change_of_an_angle_is_the_smaller_way_round(before, after):
+    encoder = Encoder(1, 1, ObservationSpec(angles=(0,)))
+    observation, next_observation = (torch.tensor([[value]], dtype=torch.float64) for value in (before, after))
+    change = encoder.targets(observation, next_observation)
+    assert abs(change.item()) <= math.pi
+    reached = encoder.next_observation(observation, change).item()
+    turns = (reached - after) / (2 * math.pi)
+    assert turns == pytest.approx(round(turns), abs=1e-12)
+
+
+def test_an_absolute_angle_is_predicted_as_it_is():
+    encoder = Encoder(1, 1, ObservationSpec(angles=(0,), absolute=(0,)))
+    assert encoder.targets(torch.tensor([[0.0]]), torch.tensor([[7.0]])).item() == 7.0
+    assert encoder.next_observation(torch.tensor([[1.0]]), torch.tensor([[7.0]])).item() == 7.0
+
+
+@st.composite
+def specs(draw):
+    size = draw(st.integers(1, 6))
+
+    def subset():
+        return tuple(sorted(draw(st.sets(st.integers(0, size - 1)))))
+
+    constant = subset()
+    if len(constant) == size:
+        constant = constant[1:]
+    return size, {"angles": subset(), "absolute": subset(), "not_inputs": subset(), "constant": constant}
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    case=specs(), action_size=st.integers(1, 3), seed=st.integers(0, 1000), batch=st.sampled_from([(), (3,), (2, 3)])
+)
+def test_the_next_observation_is_recovered_from_the_targets(case, action_size, seed, batch):
+    size, spec = case[0], ObservationSpec(**case[1])
+    encoder, generator = Encoder(size, action_size, spec), seeded(seed)
+    observation, after = 3.0 * normal(generator, *batch, size), 3.0 * normal(generator, *batch, size)
+    target = encoder.targets(observation, after)
+    assert target.shape == (*batch, encoder.target_size)
+    recovered = encoder.next_observation(observation, target)
+    for i in range(size):
+        if i in spec.constant:
+            assert torch.equal(recovered[..., i], observation[..., i])
+            continue
+        error = recovered[..., i] - after[..., i]
+        if i in spec.angles and i not in spec.absolute:
+            error = torch.sin(0.5 * error)  # zero for whole turns
+        assert error.abs().max() < 1e-12
+    inputs = encoder.inputs(observation, normal(generator, *batch, action_size))
+    assert inputs.shape == (*batch, encoder.input_size)
+
+
+def test_inputs_do_not_see_a_whole_turn_nor_what_is_not_fed():
+    encoder = Encoder(4, 1, ObservationSpec(angles=(1,), not_inputs=(3,)))
+    observation, action = normal(seeded(), 5, 4), normal(seeded(1), 5, 1)
+    moved = observation + torch.tensor([0.0, 2 * math.pi, 0.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(encoder.inputs(moved, action), encoder.inputs(observation, action), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("field", ["angles", "absolute", "not_inputs", "constant"])
+@pytest.mark.parametrize("indices", [(4,), (-1,), (0, 0)])
+def test_bad_indices_are_named(field, indices):
+    with pytest.raises(ValueError, match=rf"{field}.*from 0 to 3.*received \({str(indices)[1:-1]}\)"):
+        Encoder(4, 1, ObservationSpec(**{field: indices}))
+
+
+def test_nothing_to_predict_is_an_error():
+    with pytest.raises(ValueError, match="nothing is left to predict: all 2 dimensions are constant"):
+        Encoder(2, 1, ObservationSpec(constant=(0, 1)))
+
+
+def test_nothing_to_feed_is_an_error():
+    with pytest.raises(ValueError, match="nothing is left to feed"):
+        Encoder(2, 0, ObservationSpec(not_inputs=(0, 1)))
+
+
+def test_the_action_alone_can_be_fed():
+    encoder = Encoder(2, 1, ObservationSpec(not_inputs=(0, 1)))
+    assert encoder.inputs(torch.zeros(3, 2), torch.full((3, 1), 2.0)).tolist() == [[2.0]] * 3

@@ -1,0 +1,61 @@
+"""Standardisation, and the dimensions that must not be divided by rounding."""
+
+import hypothesis.extra.numpy as hnp
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+
+from gym_dgpmpc.data.normaliser import Normaliser
+from tests.oracles.models import normal, seeded
+
+
+def test_fitted_data_have_zero_mean_and_unit_deviation():
+    data = normal(seeded(), 200, 3) * torch.tensor([1e-4, 1.0, 1e6]).double() + torch.tensor([1.0, 0.0, -1e7]).double()
+    standardised = Normaliser.fit(data)(data)
+    torch.testing.assert_close(standardised.mean(0), torch.zeros(3).double(), rtol=0, atol=1e-9)
+    torch.testing.assert_close(standardised.std(0, correction=0), torch.ones(3).double(), rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, 0.1, -1234.5])
+def test_a_constant_dimension_becomes_zero(value):
+    normaliser = Normaliser.fit(torch.full((50, 1), value))
+    assert normaliser.std.item() == 1.0
+    assert normaliser(torch.full((50, 1), value)).abs().max() < 1e-3  # 0.1 is not the same in both precisions
+    assert normaliser.mean.item() == pytest.approx(value, rel=1e-7)
+
+
+@pytest.mark.parametrize("value", [1.0, 1e-3, 2.5e4])
+def test_rounding_of_single_precision_is_not_a_signal(value):
+    """A fixed goal that the simulator computes anew at each step differs in the last bit."""
+    single = np.float32(value)
+    data = torch.tensor([single, np.nextafter(single, np.float32(np.inf))] * 20).unsqueeze(1)
+    assert len(data.unique()) == 2
+    assert Normaliser.fit(data).std.item() == 1.0
+
+
+def test_a_small_signal_on_a_large_offset_is_kept():
+    data = 100.0 + 1e-2 * normal(seeded(), 500, 1)
+    assert Normaliser.fit(data.float()).std.item() == pytest.approx(1e-2, rel=0.1)
+
+
+def test_one_row_is_enough():
+    normaliser = Normaliser.fit(torch.tensor([[3.0, -1.0]]))
+    assert normaliser.mean.tolist() == [3.0, -1.0] and normaliser.std.tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_statistics_are_double_precision(dtype):
+    normaliser = Normaliser.fit(torch.ones(4, 2, dtype=dtype))
+    assert normaliser.mean.dtype == normaliser.std.dtype == torch.float64
+
+
+@settings(max_examples=60, deadline=None)
+@given(hnp.arrays(np.float64, hnp.array_shapes(min_dims=2, max_dims=2, max_side=6), elements=st.floats(-1e6, 1e6)))
+def test_the_inverse_undoes_it(data):
+    data = torch.from_numpy(data)
+    normaliser = Normaliser.fit(data)
+    assert (normaliser.std > 0).all()
+    scale = data.abs().amax().item() + normaliser.std.max().item()
+    torch.testing.assert_close(normaliser.inverse(normaliser(data)), data, rtol=0, atol=1e-12 * scale)
