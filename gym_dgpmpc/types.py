@@ -47,6 +47,7 @@ class ObservationSpec:
     constant: tuple[int, ...] = ()
 
 
+@runtime_checkable
 class RewardFn(Protocol):
     """The reward r(s_t, a_t, s_{t+1}), batched over any leading dimensions; the same function ``env.step`` uses."""
 
@@ -58,12 +59,14 @@ class RewardFn(Protocol):
     ) -> Float[Tensor, "*b"]: ...
 
 
+@runtime_checkable
 class TerminatedFn(Protocol):
     """Whether the episode ends in s_{t+1}, batched over any leading dimensions."""
 
     def __call__(self, next_observation: Float[Tensor, "*b S"]) -> Bool[Tensor, "*b"]: ...
 
 
+@runtime_checkable
 class TransitionSampler(Protocol):
     """One draw of the world, valid for one plan: P particles, each a map (state, action) -> next state.
 
@@ -116,6 +119,7 @@ class PlanInfo(NamedTuple):
     num_iterations: int
 
 
+@runtime_checkable
 class Planner(Protocol):
     """Improves a plan under an objective; knows neither the model nor the environment."""
 
