@@ -42,7 +42,7 @@ class Encoder:
         self.input_size = len(self.plain) + 2 * len(self.angles) + action_size
         self.target_size = len(self.predicted)
         if not self.input_size:
-            raise ValueError(f"nothing is left to feed: there is no action, and not_inputs holds all dimensions in {spec}")
+            raise ValueError(f"nothing is left to feed: there is no action, and not_inputs is everything in {spec}")
         self._is_change = torch.tensor([i not in spec.absolute for i in self.predicted])
         self._wraps = torch.tensor([i in spec.angles and i not in spec.absolute for i in self.predicted])
 
