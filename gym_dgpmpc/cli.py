@@ -31,10 +31,11 @@ RUN = "Run"
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 
-def _show_version(value: bool) -> None:
+def _show_version(value: bool) -> bool:
     if value:
         typer.echo(f"dgpmpc {importlib.metadata.version('gym-dgpmpc')}")
         raise typer.Exit
+    return value
 
 
 @app.callback()
@@ -108,6 +109,8 @@ def train(
     learning_starts: options.LearningStarts = None,
     first_training_iterations: options.FirstTraining = None,
     training_iterations: options.Training = None,
+    num_samples: options.NumSamples = None,
+    sample_spacing: options.SampleSpacing = None,
     resample_steps: options.Resample = None,
 ) -> None:
     """Train an agent, and leave results, pictures and the agent itself in a folder.
@@ -130,6 +133,8 @@ def train(
         learning_starts=learning_starts,
         first_training_iterations=first_training_iterations,
         training_iterations=training_iterations,
+        num_samples=num_samples,
+        sample_spacing=sample_spacing,
         resample_steps=resample_steps,
         seed=seed,
     )

@@ -83,6 +83,10 @@ FirstTraining = Annotated[
 Training = Annotated[
     int | None, _training("--training", "Iterations of each later training, at every episode's start.", "1000")
 ]
+NumSamples = Annotated[
+    int | None, _training("--samples", "Posterior samples kept, from which a plan's worlds are drawn.", "100")
+]
+SampleSpacing = Annotated[int | None, _training("--spacing", "Sampler steps between two kept samples.", "10")]
 Resample = Annotated[
     int | None, _training("--resample", "Sampler steps on the grown data after each control step.", "5", 0)
 ]

@@ -1,0 +1,138 @@
+"""A run keeps its results as they come, and goes on where its last finished episode ended."""
+
+import json
+
+import gymnasium
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+
+from gym_dgpmpc.agents import DGPMPCAgent
+from gym_dgpmpc.errors import PlanningError
+from gym_dgpmpc.reporting.run import RunFolder, RunFolderError, TrainingRun
+from tests.reporting.toy import EPISODE_STEPS, SMALLEST_AGENT
+
+SETTINGS = {"environment": "ToyPush-v0", "seed": 0}
+
+
+def training_run(path, num_episodes=2, env_id="ToyPush-v0", **env_arguments):
+    folder = RunFolder(path, SETTINGS)
+    env = gymnasium.make(env_id, **env_arguments)
+    steps = EPISODE_STEPS * (1 + num_episodes)
+    run = TrainingRun(folder, env, SMALLEST_AGENT | {"seed": 0}, num_episodes=num_episodes, total_timesteps=steps)
+    folder.write_settings(episodes=num_episodes)
+    return run
+
+
+def test_results(tmp_path, capsys):
+    run = training_run(tmp_path, render_mode="rgb_array")
+    assert not run.is_complete
+    run.train(progress_bar=False)
+    rows = run.folder.rows()
+    assert [(row.episode, row.actions, row.steps, row.total_steps) for row in rows] == [
+        (1, "random", 12, 12),
+        (2, "planned", 12, 24),
+        (3, "planned", 12, 36),
+    ]
+    assert rows[-1].episode_return == run.recorder.last.rewards.sum()
+    assert all(row.seconds > 0 for row in rows)
+    assert capsys.readouterr().out.count("episode") == 3
+    written = run.write_figures("a title")
+    assert [path.name for path in written] == ["learning_curve.png", "prediction_fan.png", "last_episode.gif"]
+    assert all(path.stat().st_size > 0 for path in written)
+    assert list((tmp_path / "tensorboard").rglob("events*"))
+    settings = json.loads((tmp_path / "settings.json").read_text())
+    assert settings["settings"] == SETTINGS
+    assert settings["episodes"] == 2
+    assert "torch" in settings["versions"]
+
+
+def test_the_saved_agent_has_learned_from_every_episode(tmp_path):
+    run = training_run(tmp_path)
+    run.train(progress_bar=False)
+    saved = DGPMPCAgent.load(run.folder.agent_file)
+    assert saved.num_fitted == len(saved.store) == 36
+
+
+def test_episodes_are_counted_though_they_are_short(tmp_path):
+    run = training_run(tmp_path, terminate_at=5)
+    with pytest.warns(UserWarning, match="terminated_fn"):
+        run.train(progress_bar=False)
+    assert [row.steps for row in run.folder.rows()] == [5, 5, 5]
+    assert run.is_complete
+    assert DGPMPCAgent.load(run.folder.agent_file).num_fitted == 15
+
+
+def test_goes_on(tmp_path):
+    run = training_run(tmp_path, num_episodes=1)
+    run.train(progress_bar=False)
+    before = run.folder.rows()
+    assert training_run(tmp_path, num_episodes=1).is_complete
+    run = training_run(tmp_path, num_episodes=3)
+    assert not run.is_complete
+    run.train(progress_bar=False)
+    rows = run.folder.rows()
+    assert rows[:2] == before
+    assert [row.episode for row in rows] == [1, 2, 3, 4]
+    assert [row.total_steps for row in rows] == [12, 24, 36, 48]
+    assert len(DGPMPCAgent.load(run.folder.agent_file).store) == 48
+
+
+class InterruptAt(BaseCallback):
+    def __init__(self, step):
+        super().__init__()
+        self.step = step
+
+    def _on_step(self):
+        if self.num_timesteps == self.step:
+            raise KeyboardInterrupt
+        return True
+
+
+def test_goes_on_after_an_interruption_within_an_episode(tmp_path):
+    run = training_run(tmp_path)
+    run.forecasts = InterruptAt(30)
+    with pytest.raises(KeyboardInterrupt):
+        run.train(progress_bar=False)
+    # As if the interruption had come between the row of an episode and the saving of its agent.
+    run.folder.append_row(run.folder.rows()[-1]._replace(episode=3, total_steps=36))
+
+    run = training_run(tmp_path)
+    assert run.agent.num_timesteps == 24
+    run.train(progress_bar=False)
+    assert [(row.episode, row.total_steps) for row in run.folder.rows()] == [(1, 12), (2, 24), (3, 36)]
+    assert run.agent.num_timesteps == 36
+
+
+def test_what_was_finished_survives_a_failure(tmp_path, monkeypatch):
+    run = training_run(tmp_path)
+
+    def fail_from_the_third_episode_on(*args, **kwargs):
+        if run.agent.num_timesteps >= 24:
+            raise PlanningError("nothing is finite")
+        return plan(*args, **kwargs)
+
+    plan = run.agent.planning.plan
+    monkeypatch.setattr(run.agent.planning, "plan", fail_from_the_third_episode_on)
+    with pytest.raises(PlanningError):
+        run.train(progress_bar=False)
+    assert len(run.folder.rows()) == 2
+    assert len(DGPMPCAgent.load(run.folder.agent_file).store) == 24
+
+
+def test_refuses_another_runs_folder(tmp_path):
+    training_run(tmp_path, num_episodes=1).train(progress_bar=False)
+    with pytest.raises(RunFolderError, match=r"other settings .seed was 0, now 1.*--overwrite"):
+        RunFolder(tmp_path, SETTINGS | {"seed": 1})
+    (tmp_path / "settings.json").write_text("[]")
+    with pytest.raises(RunFolderError, match="without readable settings"):
+        RunFolder(tmp_path, SETTINGS)
+
+
+def test_overwrites_only_when_asked(tmp_path):
+    run = training_run(tmp_path, num_episodes=1)
+    run.train(progress_bar=False)
+    run.write_figures("")
+    (tmp_path / "notes.txt").write_text("mine")
+    folder = RunFolder(tmp_path, {"seed": 1}, overwrite=True)
+    assert not folder.goes_on
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

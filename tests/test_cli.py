@@ -1,0 +1,209 @@
+"""`dgpmpc` does what its help says, and says in one line what is wrong."""
+
+import csv
+import importlib.metadata
+import inspect
+import json
+import re
+import subprocess
+import sys
+import typing
+
+import pytest
+from typer.testing import CliRunner
+
+from gym_dgpmpc import cli, options
+from gym_dgpmpc.agents import DGPMPCAgent
+from gym_dgpmpc.agents.presets import PAPER
+from gym_dgpmpc.dynamics.deep_gp_draws import DRAWS, REFRESHES
+from gym_dgpmpc.gp.kernels import KERNELS
+from gym_dgpmpc.reporting import rendering
+from tests.reporting.toy import ENV_ID
+
+SMALLEST = ["--layers=1", "--inducing=4", "--features=4", "--particles=2", "--horizon=3", "--candidates=6"]
+SMALLEST += ["--iterations=1", "--first-training=2", "--training=2", "--samples=2", "--spacing=1", "--resample=0"]
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Calls the command in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    runner = CliRunner()
+    return lambda *arguments: runner.invoke(cli.app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def drawable(monkeypatch):
+    """The toy needs no OpenGL, and a process of its own would take seconds to find that out."""
+    monkeypatch.setattr(rendering, "probe_rendering", lambda env_id: rendering.Rendering(True))
+
+
+def is_one_line_error(result, *texts):
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+    for text in texts:
+        assert text in result.stderr
+    return True
+
+
+def shown_defaults():
+    """What the help of `dgpmpc train` shows for the options that can be left open."""
+    hints = typing.get_type_hints(cli.train, include_extras=True)
+    return {name: hints[name].__metadata__[0].show_default for name in hints if hasattr(hints[name], "__metadata__")}
+
+
+def test_train_and_evaluate(run, tmp_path, drawable):
+    result = run("train", ENV_ID, *SMALLEST, "--episodes", 2, "--out", "a")
+    assert result.exit_code == 0, result.output
+    assert len(re.findall(r"^episode +\d", result.stdout, re.MULTILINE)) == 3
+    assert "return of 2 planned episodes: mean" in result.stdout
+    assert "next: dgpmpc evaluate a" in result.stdout
+    assert {path.name for path in (tmp_path / "a").iterdir()} == {
+        "agent.zip",
+        "episodes.csv",
+        "last_episode.gif",
+        "learning_curve.png",
+        "prediction_fan.png",
+        "settings.json",
+        "tensorboard",
+    }
+    rows = list(csv.DictReader((tmp_path / "a" / "episodes.csv").open()))
+    assert [row["actions"] for row in rows] == ["random", "planned", "planned"]
+    settings = json.loads((tmp_path / "a" / "settings.json").read_text())["settings"]
+    assert settings["num_candidates"] == 6
+    assert settings["kernel"] == "matern32"
+
+    result = run("evaluate", "a", "--env", ENV_ID, "--episodes", 2, "--video", "b.gif")
+    assert result.exit_code == 0, result.output
+    assert len(re.findall(r"^episode +\d", result.stdout, re.MULTILINE)) == 2
+    assert "mean return" in result.stdout
+    assert (tmp_path / "b.gif").stat().st_size > 0
+    assert run("evaluate", "a/agent.zip", "--episodes", 2).stdout.splitlines()[:3] == result.stdout.splitlines()[:3]
+
+
+def test_the_same_command_goes_on_or_says_that_it_is_done(run):
+    command = ("train", ENV_ID, *SMALLEST, "--no-video", "--out", "a")
+    assert run(*command, "--episodes", 1).exit_code == 0
+    done = run(*command, "--episodes", 1)
+    assert done.exit_code == 0
+    assert "finished" in done.stdout
+    more = run(*command, "--episodes", 2)
+    assert more.exit_code == 0
+    assert "goes on after step 24" in more.stdout
+    assert is_one_line_error(run(*command, "--seed", 1), "seed was 0, now 1", "--overwrite")
+    assert run(*command, "--seed", 1, "--episodes", 1, "--overwrite").exit_code == 0
+
+
+def test_timesteps_and_default_folder(run, tmp_path):
+    result = run("train", ENV_ID, *SMALLEST, "--no-video", "--timesteps", 20, "--seed", 3)
+    assert result.exit_code == 0, result.output
+    assert "20 environment steps" in result.stdout
+    assert (tmp_path / "runs" / "ToyPush-v0-seed3" / "agent.zip").exists()
+
+
+def test_same_seed_same_run(run, tmp_path):
+    for out in ("a", "b"):
+        assert run("train", ENV_ID, *SMALLEST, "--no-video", "--episodes", 1, "--out", out).exit_code == 0
+    returns = [
+        [row["episode_return"] for row in csv.DictReader((tmp_path / out / "episodes.csv").open())] for out in "ab"
+    ]
+    assert returns[0] == returns[1]
+
+
+def test_without_opengl_only_the_video_is_missing(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(rendering, "probe_rendering", lambda env_id: rendering.Rendering(False, None, "no GL: get it"))
+    result = run("train", ENV_ID, *SMALLEST, "--episodes", 1, "--out", "a")
+    assert result.exit_code == 0, result.output
+    assert "no GIF: no GL: get it\n" in result.stdout
+    assert not (tmp_path / "a" / "last_episode.gif").exists()
+    assert (tmp_path / "a" / "learning_curve.png").exists()
+    result = run("evaluate", "a", "--episodes", 1, "--video", "b.gif")
+    assert result.exit_code == 0, result.output
+    assert "no GIF: no GL: get it\n" in result.stdout
+
+
+def test_interruption(run, monkeypatch):
+    def interrupt(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(DGPMPCAgent, "learn", interrupt)
+    result = run("train", ENV_ID, *SMALLEST, "--no-video", "--out", "a")
+    assert result.exit_code == 130
+    assert "the same command goes on" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "texts"),
+    [
+        (["NoSuchEnv-v0"], ["NoSuchEnv"]),
+        (["no_such_module:Env-v0"], ["no_such_module"]),
+        (["CartPole-v1"], ["action spaces", "Discrete"]),
+        (["ToyPushWithoutReward-v0"], ["ToyPushWithoutReward-v0", "reward_fn"]),
+        (["ToyPushForever-v0"], ["no time limit", "--timesteps"]),
+        (["ToyPush-v0", "--episodes", "1", "--timesteps", "5"], ["either --episodes or --timesteps"]),
+        (["ToyPush-v0", "--candidates", "5", "--elites", "6"], ["6"]),
+        (["ToyPush-v0", "--horizon", "2", "--actions-per-plan", "3"], ["horizon 2", "got 3"]),
+    ],
+)
+def test_train_says_what_is_wrong(run, tmp_path, arguments, texts):
+    assert is_one_line_error(run("train", *arguments, "--no-video"), *texts)
+    assert not list(tmp_path.rglob("*.*"))
+
+
+@pytest.mark.parametrize("option", ["--layers=0", "--kernel=linear", "--draw=x", "--episodes=0", "--seed=-1"])
+def test_limits_of_options(run, option):
+    result = run("train", "ToyPush-v0", option)
+    assert result.exit_code == 2
+    assert option.split("=")[0] in result.stderr
+
+
+def test_evaluate_says_what_is_wrong(run, tmp_path):
+    assert is_one_line_error(run("evaluate", "nothing.zip"), "nothing.zip")
+    assert is_one_line_error(run("evaluate", "."), "agent.zip")
+    (tmp_path / "text.zip").write_text("no agent")
+    assert is_one_line_error(run("evaluate", "text.zip"), "text.zip")
+    run("train", ENV_ID, *SMALLEST, "--no-video", "--episodes", 1, "--out", "a")
+    assert is_one_line_error(run("evaluate", "a", "--env", "ModCartPole-v0"), "saved for observations")
+
+
+def test_version_and_help(run):
+    version = run("--version")
+    assert version.exit_code == 0
+    assert version.stdout == f"dgpmpc {importlib.metadata.version('gym-dgpmpc')}\n"
+    for command in ([], ["train"], ["evaluate"]):
+        shown = run(*command, "--help")
+        assert shown.exit_code == 0
+        assert "Usage" in shown.stdout
+
+
+def test_help_does_not_wait_for_pytorch():
+    script = "import sys, gym_dgpmpc.cli; sys.exit('torch' in sys.modules or 'mujoco' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script]).returncode == 0
+
+
+def test_runs_as_a_module():
+    result = subprocess.run([sys.executable, "-m", "gym_dgpmpc", "--version"], capture_output=True, text=True)
+    assert result.stdout.startswith("dgpmpc ")
+
+
+def test_options_show_the_agents_defaults_and_the_presets():
+    arguments = inspect.signature(DGPMPCAgent).parameters
+    options_of_the_agent = {name: shown for name, shown in shown_defaults().items() if name in arguments}
+    assert len(options_of_the_agent) == 19
+    del options_of_the_agent["seed"]  # the command line has a default of its own
+    assert inspect.signature(cli.train).parameters.keys() >= options_of_the_agent.keys()
+    for name, shown in options_of_the_agent.items():
+        default = arguments[name].default
+        assert inspect.signature(cli.train).parameters[name].default is None
+        assert default is None or shown.split(",")[0] == str(default)
+        presets = {preset[name] for preset in PAPER.values() if name in preset}
+        assert ("ENV_ID" in shown) == bool(presets - {default}) or name == "num_elites"
+    assert options_of_the_agent["num_elites"] == "a tenth of the candidates"
+    assert all(10 * preset["num_elites"] == preset["num_candidates"] for preset in PAPER.values())
+
+
+def test_choices_are_the_models():
+    assert {name.value for name in options.KernelName} == set(KERNELS)
+    assert {name.value for name in options.DrawName} == set(DRAWS)
+    assert {name.value for name in options.RefreshName} == set(REFRESHES)
