@@ -217,7 +217,8 @@ class DeepGPDynamics:
         if self._fitted is None:
             return {}
         fitted = self._fitted
-        state: StateDict = {"pool": fitted.pool, "oldest": fitted.oldest, "log_noise": fitted.model.log_noise}
+        # The pool is the one tensor that changes in place, and a state should not change after it was taken.
+        state: StateDict = {"pool": fitted.pool.clone(), "oldest": fitted.oldest, "log_noise": fitted.model.log_noise}
         for index, layer in enumerate(fitted.model.layers):
             state |= {f"layers.{index}.{name}": value for name, value in layer._asdict().items()}
         for name, normaliser in zip(_NORMALISERS, fitted.normalisers, strict=True):
@@ -228,7 +229,7 @@ class DeepGPDynamics:
         """Restore `state_dict` of a model with the same settings.
 
         Raises:
-            ValueError: a tensor is missing or has another shape than these settings give it.
+            ValueError: an entry is missing or is not what these settings give it; the model stays as it was.
         """
         if not state:
             self._fitted, self._factors = None, []
@@ -257,9 +258,13 @@ class DeepGPDynamics:
         )
         model = DeepGP(layers, take("log_noise", self.encoder.target_size))
         chain = sghmc.SGHMCState(*(take(f"chain.{name}", whitened) for name in sghmc.SGHMCState._fields))
-        pool = take("pool", self.num_samples, whitened)
-        self._fitted = _Fitted(model, (inputs, targets), chain, pool, int(state["oldest"]))
+        pool, oldest = take("pool", self.num_samples, whitened), state.get("oldest")
+        if not isinstance(oldest, int) or not 0 <= oldest < self.num_samples:
+            raise ValueError(
+                f"dynamics state 'oldest': expected a row of the pool, 0 to {self.num_samples - 1}, received {oldest!r}"
+            )
         self._factors = factorise_all(self.kernel, model)
+        self._fitted = _Fitted(model, (inputs, targets), chain, pool, oldest)
 
     def _encode(self, data: Transitions) -> tuple[Tensor, Tensor]:
         observation, action, after = (t.to(self.device, torch.float64) for t in data)
