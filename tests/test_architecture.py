@@ -1,6 +1,7 @@
 """What holds for every module: layers, documentation, length, and what must not be imported or called."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -68,6 +69,9 @@ TORCH_RANDOM = {
 TENSOR_RANDOM = {
     "bernoulli_", "cauchy_", "exponential_", "geometric_", "log_normal_", "normal_", "random_", "uniform_",
 }  # fmt: skip
+
+
+NOTATION = PACKAGE.parent / "docs" / "notation.md"
 
 
 def imports(tree: ast.AST) -> set[str]:
@@ -180,6 +184,16 @@ def test_randomness_is_an_argument(tree):
 
 def test_needs_no_newer_python(tree):
     assert too_new(tree) == []
+
+
+def test_the_notation_names_what_there_is():
+    quoted = re.findall(r"`([^`]+)`", NOTATION.read_text(encoding="utf-8"))
+    paths = {name for name in quoted if "/" in name or name.endswith(".py")}
+    assert [name for name in paths if not (PACKAGE / name).exists()] == []
+    # A name such as `Plan.mean`, `draw` or `states[t, p, k]`: every word of two letters or more is in the code.
+    words = {word for name in set(quoted) - paths for word in re.findall(r"[A-Za-z_]{2,}", name)}
+    code = {word for path in MODULES.values() for word in re.findall(r"\w+", path.read_text(encoding="utf-8"))}
+    assert words - code - {"TaskHorizon"} == set()
 
 
 @pytest.mark.parametrize(
