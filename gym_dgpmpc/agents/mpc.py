@@ -81,6 +81,9 @@ class MPCAgent(PlanningAgent):
         an episode's start; it is also done when the last step ends an episode, so that the agent one gets has seen
         every finished episode.
 
+        An environment that was stepped by others in between (`evaluate_policy` on the very object that the agent
+        learns in) cannot go on where it was: then leave ``reset_num_timesteps`` as it is, or call ``set_env`` first.
+
         Whatever goes wrong, the transitions observed so far stay in ``agent.store``, and `learn` can be called again.
 
         Args:
@@ -94,7 +97,10 @@ class MPCAgent(PlanningAgent):
         Raises:
             EnvironmentDataError: the environment returned something that is not finite.
             PlanningError: no candidate plan had a finite return.
+            ValueError: the agent was loaded without an environment.
         """
+        if self.env is None:
+            raise ValueError("the agent has no environment to learn in: pass env=... to load, or call set_env(env)")
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )

@@ -86,6 +86,7 @@ class LinearModel:
         return {}
 
     def draw(self, num_particles, horizon, generator):
+        assert not torch.is_grad_enabled()
         noise = torch.randn(num_particles, *self.mean.shape, generator=generator)
         weight = self.mean + 1e-3 * (1 + 1e-2 * self.moved) * noise
 

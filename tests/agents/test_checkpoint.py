@@ -56,7 +56,7 @@ def test_the_loaded_agent_is_the_saved_one(tmp_path):
             np.testing.assert_array_equal(action, other)
 
 
-@pytest.mark.parametrize("stop", [LENGTH // 2, LENGTH, 3 * LENGTH])
+@pytest.mark.parametrize("stop", [LENGTH // 2, LENGTH, 5 * LENGTH // 2, 3 * LENGTH])
 def test_learning_goes_on_as_if_it_had_not_stopped(stop, tmp_path):
     """From an episode's start, and, in an environment that still runs, from its middle."""
     whole = agent(KnownPointMass(fixed_start=True))
@@ -139,6 +139,8 @@ def test_without_an_environment_an_agent_predicts_if_it_is_given_the_reward(save
     alone = MPCAgent.load(saved, reward_fn=reward_fn, **parts)
     expected = load(saved).predict(OBSERVATIONS[0], deterministic=True)[0]
     np.testing.assert_array_equal(alone.predict(OBSERVATIONS[0], deterministic=True)[0], expected)
+    with pytest.raises(ValueError, match=r"no environment to learn in.*set_env"):
+        alone.learn(10)
     later = MPCAgent.load(saved, **parts)
     later.set_env(KnownPointMass())
     np.testing.assert_array_equal(later.predict(OBSERVATIONS[0], deterministic=True)[0], expected)

@@ -117,6 +117,23 @@ def test_one_seed_decides_everything():
     assert not np.array_equal(actions_of(runs[0].env.envs[0]), actions_of(runs[2].env.envs[0]))
 
 
+def test_every_use_of_randomness_has_its_own_generator():
+    used = {"fit": set(), "resample": set(), "draw": set()}
+
+    class Recording(LinearModel):
+        def __getattribute__(self, name):
+            method = super().__getattribute__(name)
+            if name in used:
+                return lambda *arguments: used[name].add(arguments[-1]) or method(*arguments)
+            return method
+
+    learner = agent(dynamics=Recording()).learn(25)
+    learner.predict(np.zeros(2))
+    generators = learner.generators
+    assert used["fit"] == used["resample"] == {generators.fit}
+    assert used["draw"] == {generators.planning, generators.prediction}
+
+
 def test_global_random_state_does_not_matter():
     first = agent()
     first.learn(25)

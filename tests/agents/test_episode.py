@@ -1,0 +1,43 @@
+"""The numbers that an episode is reported by."""
+
+import pytest
+
+from gym_dgpmpc.agents.episode import EpisodeRecord
+from gym_dgpmpc.types import PlanInfo
+
+
+def record_of(rewards, plans, horizon=2):
+    """A record of these rewards, with plans {step: expected return}."""
+    record = EpisodeRecord(3, horizon)
+    for step, reward in enumerate(rewards):
+        if step in plans:
+            record.add_plan(PlanInfo(plans[step], step, 4), 0.001 * (step + 1))
+        record.add_reward(reward)
+    return record
+
+
+def test_predicted_and_obtained_are_over_the_same_steps():
+    record = record_of([1.0, 2.0, 4.0, 8.0], {0: 3.0, 2: 20.0})
+    assert record.predicted_and_obtained() == ((1.5 + 10.0) / 2, (1.5 + 6.0) / 2)
+
+
+def test_steps_beyond_the_end_are_left_out_of_what_was_obtained():
+    assert record_of([1.0, 2.0, 4.0], {2: 6.0}).predicted_and_obtained() == (3.0, 4.0)
+
+
+def test_metrics():
+    metrics = record_of([1.0, 2.0, 4.0, 8.0], {0: 3.0, 2: 20.0}).metrics()
+    assert metrics["rollout/ep_return"] == 15.0
+    assert metrics["rollout/ep_length"] == 4
+    assert metrics["planner/expected_return"] == 11.5
+    assert metrics["planner/num_nonfinite"] == 2
+    assert metrics["planner/num_iterations"] == 4
+    assert metrics["time/plan_ms"] == pytest.approx(2.0)
+    assert metrics["time/plan_ms_p95"] == pytest.approx(2.9)
+    assert not any(name.startswith("planner/") for name in record_of([1.0], {}).metrics())
+
+
+def test_the_line_tells_of_candidates_that_diverged():
+    assert "2 candidates not finite" in record_of([1.0] * 3, {2: 1.0}).line(30)
+    assert "not finite" not in record_of([1.0] * 3, {0: 1.0}).line(30)
+    assert record_of([1.0], {}).line(30).endswith("random actions")
