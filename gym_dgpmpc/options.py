@@ -78,15 +78,15 @@ LearningStarts = Annotated[
 ]
 FirstTraining = Annotated[
     int | None,
-    _training("--first-training", "Iterations of the first training.", "4000"),
+    _training("--first-training", "Iterations of the first training.", "8000"),
 ]
 Training = Annotated[
-    int | None, _training("--training", "Iterations of each later training, at every episode's start.", "1000")
+    int | None, _training("--training", "Iterations of each later training, at every episode's start.", "2000")
 ]
 NumSamples = Annotated[
     int | None, _training("--samples", "Posterior samples kept, from which a plan's worlds are drawn.", "100")
 ]
 SampleSpacing = Annotated[int | None, _training("--spacing", "Sampler steps between two kept samples.", "10")]
 Resample = Annotated[
-    int | None, _training("--resample", "Sampler steps on the grown data after each control step.", "5", 0)
+    int | None, _training("--resample", "Sampler steps on the grown data after each control step.", "20", 0)
 ]
