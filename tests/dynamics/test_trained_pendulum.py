@@ -1,0 +1,88 @@
+"""Models trained to convergence on a pendulum, at a size near that of real runs: what they learn, and in float32."""
+
+import pytest
+import torch
+
+from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.gp.kernels import KERNELS
+from gym_dgpmpc.inference.mcem import InferenceSettings
+from gym_dgpmpc.planning.rollout import rollout
+from tests.oracles import pendulum
+from tests.oracles.models import normal, seeded
+
+DATA = pendulum.simulate(200)
+HORIZON, CANDIDATES, PARTICLES = 30, 20, 5
+SETTINGS = {
+    "num_layers": 2, "num_inducing": 100, "num_features": 128, "first_iterations": 300, "num_samples": 5,
+    "sample_spacing": 2, "inference": InferenceSettings(step_size=0.03, learning_rate=0.03),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=KERNELS)
+def trained(request):
+    model = DeepGPDynamics(2, 1, pendulum.SPEC, kernel=request.param, **SETTINGS)
+    model.fit(DATA, seeded())
+    return model
+
+
+def twin(trained, dtype, **settings):
+    """The same posterior, rolled out in another precision or by another draw."""
+    model = DeepGPDynamics(2, 1, pendulum.SPEC, kernel=trained.kernel, dtype=dtype, **(SETTINGS | settings))
+    model.load_state_dict(trained.state_dict())
+    return model
+
+
+def test_it_predicts_unseen_transitions(trained):
+    """The squared error of the mean prediction is a small part of the squared change."""
+    test = pendulum.simulate(60, seed=1)
+    after = trained.draw(PARTICLES, 1, seeded())(test.observation.expand(PARTICLES, -1, -1).clone(), test.action, 0)
+    change = (test.next_observation - test.observation).square().mean(0)
+    assert ((after.mean(0) - test.next_observation).square().mean(0) < 0.1 * change).all()
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        {"draw": "pathwise", "refresh": "step"},
+        {"draw": "pathwise", "refresh": "plan"},
+        {"draw": "joint"},
+        {"draw": "marginal"},
+    ],
+    ids=["step", "plan", "joint", "marginal"],
+)
+def test_rollouts_in_single_precision_are_those_in_double(trained, draw):
+    """Same generator, same functions: one step within 1e-3 of the state's scale, and 99 % of all states of rollouts.
+
+    Functions drawn with Matern-1/2 have no slope that bounds how a difference grows: their rollouts in double
+    precision part from each other, too, when every step adds noise of the size of a step's rounding.
+    """
+    actions = 2 * torch.rand(CANDIDATES, HORIZON, 1, generator=seeded(1), dtype=torch.float32) - 1
+    scale = DATA.observation.std(0)
+
+    def sampler(dtype):
+        return twin(trained, dtype, **draw).draw(PARTICLES, HORIZON, seeded(2))
+
+    def states(world, dtype):
+        return rollout(world, torch.zeros(2, dtype=dtype), actions.to(dtype), PARTICLES)
+
+    double, single = states(sampler(torch.float64), torch.float64), states(sampler(torch.float32), torch.float32)
+    assert double.dtype == torch.float64 and single.dtype == torch.float32
+
+    exact, rounded = sampler(torch.float64), sampler(torch.float32)
+    for step in range(HORIZON):  # one step at a time, from the same states
+        state, action = single[step], actions[:, step]
+        error = rounded(state, action, step) - exact(state.double(), action.double(), step)
+        assert (error.abs() / scale).max() < 1e-3
+
+    def difference(other):
+        return ((other - double).abs() / scale).flatten().quantile(0.99)
+
+    bound = 1e-3
+    if trained.kernel == "matern12" and draw["draw"] == "pathwise":
+        exact, generator = sampler(torch.float64), seeded(3)
+
+        def perturbed(state, action, step):
+            return exact(state, action, step) + 3e-5 * scale * normal(generator, *state.shape)
+
+        bound = 3 * difference(states(perturbed, torch.float64))
+    assert difference(single) < bound
