@@ -55,7 +55,7 @@ Kernel = Annotated[KernelName | None, _model("--kernel", "Covariance function of
 NumInducing = Annotated[int | None, _model("--inducing", "Inducing points per layer.", "200")]
 Draw = Annotated[DrawName | None, _model("--draw", _DRAW, "pathwise", None)]
 Refresh = Annotated[RefreshName | None, _model("--refresh", _REFRESH, "step", None)]
-NumFeatures = Annotated[int | None, _model("--features", "Random features of a pathwise draw.", "256")]
+NumFeatures = Annotated[int | None, _model("--features", "Random features of a pathwise draw.", "128")]
 
 NumParticles = Annotated[int | None, _planner("--particles", "Worlds that a plan's return is averaged over.", "5")]
 Horizon = Annotated[
@@ -81,12 +81,12 @@ FirstTraining = Annotated[
     _training("--first-training", "Iterations of the first training.", "8000"),
 ]
 Training = Annotated[
-    int | None, _training("--training", "Iterations of each later training, at every episode's start.", "2000")
+    int | None, _training("--training", "Iterations of each later training, at every episode's start.", "1500")
 ]
 NumSamples = Annotated[
     int | None, _training("--samples", "Posterior samples kept, from which a plan's worlds are drawn.", "100")
 ]
-SampleSpacing = Annotated[int | None, _training("--spacing", "Sampler steps between two kept samples.", "10")]
+SampleSpacing = Annotated[int | None, _training("--spacing", "Sampler steps between two kept samples.", "50")]
 Resample = Annotated[
-    int | None, _training("--resample", "Sampler steps on the grown data after each control step.", "20", 0)
+    int | None, _training("--resample", "Sampler steps on the grown data after each control step.", "10", 0)
 ]

@@ -24,14 +24,14 @@ class InferenceSettings:
     """Settings of the sampler and the hyperparameter optimiser.
 
     Attributes:
-        step_size: epsilon of SG-HMC.
+        step_size: epsilon of SG-HMC; twice the value of Havasi et al., see docs/deviations.md.
         decay: m, the friction of SG-HMC.
         learning_rate: of Adam.
         window_size: number of latest positions the M-step draws from.
         batch_size: observations per gradient; all of them where there are fewer.
     """
 
-    step_size: float = 0.01
+    step_size: float = 0.02
     decay: float = 0.05
     learning_rate: float = 0.01
     window_size: int = 100
