@@ -1,0 +1,1 @@
+"""Transitions as they are stored, and what a dynamics model reads of them: encoding and standardisation."""

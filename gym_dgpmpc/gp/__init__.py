@@ -1,0 +1,1 @@
+"""Deep Gaussian processes: kernels, factorisation, random features, sparse layers and their composition."""
