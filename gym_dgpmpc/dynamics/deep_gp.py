@@ -213,7 +213,7 @@ class DeepGPDynamics:
         return ConditionalSampler(posterior, coordinates, generator, joint=self.draw_kind == "joint")
 
     def state_dict(self) -> StateDict:
-        """Everything that was learned: hyperparameters, normalisers, the chain and the whole pool. Empty if unfitted."""
+        """Hyperparameters, normalisers, the chain and the whole pool of samples; empty before the first fit."""
         if self._fitted is None:
             return {}
         fitted = self._fitted
