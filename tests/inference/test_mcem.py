@@ -198,3 +198,17 @@ def test_the_prior_weighs_less_the_more_data_there_are():
     factors, v = factorise_all("rbf", model), normal(seeded(1), model.num_whitened())
     values = [mcem.negative_log_joint("rbf", model, factors, v, data, n, seeded()).item() for n in (8, 80)]
     assert values[0] - values[1] == pytest.approx(0.5 * v.square().sum().item() * (1 / 8 - 1 / 80), rel=1e-10)
+
+
+def test_the_window_holds_the_latest_positions_and_no_others():
+    """A window that is not yet full is used as far as it goes; one of a single position is the chain's own."""
+    train = waves(20, 0)
+    start = initial_model(train, 1, 5, seeded())
+    chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
+
+    def lengthscale(window_size):
+        settings = InferenceSettings(step_size=0.1, window_size=window_size)
+        return mcem.train("rbf", start, chain, train, 6, seeded(), settings).model.layers[0].log_lengthscale
+
+    assert torch.equal(lengthscale(6), lengthscale(600))
+    assert not torch.equal(lengthscale(6), lengthscale(1))
