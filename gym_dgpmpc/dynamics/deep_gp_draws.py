@@ -98,9 +98,10 @@ def _draw_layer(
     scaled = layer.inducing_inputs / layer.lengthscale
     features = draw_features(kernel, num_features, input_size, generator, dtype=scaled.dtype)
     columns = num_functions * num_particles * outputs
-    options = {"generator": generator, "dtype": scaled.dtype, "device": scaled.device}
-    w = torch.randn(num_features, columns, **options)
-    e = torch.randn(num_inducing, columns, **options)
+    normals = torch.randn(
+        num_features + num_inducing, columns, generator=generator, dtype=scaled.dtype, device=scaled.device
+    )
+    w, e = normals.split([num_features, num_inducing])
     sigma = layer.variance.sqrt()
     prior = sigma * (features(scaled) @ w + JITTER**0.5 * e)
     v = whitened.movedim(0, 1).unsqueeze(1).expand(-1, num_functions, -1, -1).reshape(num_inducing, columns)
@@ -157,37 +158,56 @@ class PathwiseSampler:
             _draw_layer(kernel, layer, factor, v, num_functions, num_features, dtype, generator)
             for layer, factor, v in zip(model.layers, factors, whitened, strict=True)
         ]
-        self._buffers: tuple[Tensor, Tensor, Tensor] | None = None
+        self._buffers: _Buffers | None = None
 
     def __call__(
         self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
     ) -> Float[Tensor, "P K S"]:
         x = self._coordinates.encode(observation, action)
+        if self._buffers is None or self._buffers.augmented.shape[:2] != x.shape[:2]:
+            self._buffers = _Buffers.allocate(x, self._layers[0])
         function = step if self._by_step else 0
         for layer in self._layers[:-1]:
-            x = x + self._evaluate(layer, x, function)
-        return self._coordinates.decode(observation, self._evaluate(self._layers[-1], x, function))
+            x = x + self._evaluate(layer, x, function, self._buffers)
+        return self._coordinates.decode(observation, self._evaluate(self._layers[-1], x, function, self._buffers))
 
-    def _evaluate(self, layer: _PathwiseLayer, x: Tensor, function: int) -> Tensor:
+    def _evaluate(self, layer: _PathwiseLayer, x: Tensor, function: int, buffers: "_Buffers") -> Tensor:
+        """f(x) - m(x) "P K O" of every particle's function."""
+        augmented, correlations, decay, waves = buffers
+        size, group = x.shape[-1], correlations.shape[0]
+        scaled = augmented[..., :size]
+        torch.mul(x, layer.inverse_lengthscale, out=scaled)
+        torch.linalg.vecdot(scaled, scaled, out=augmented[..., size])
+        kernel_out, feature_out = layer.kernel_out[function], layer.feature_out[function]
+        out = x.new_empty(*x.shape[:2], kernel_out.shape[-1])
+        for first in range(0, len(x), group):
+            own = slice(first, first + group)
+            points = augmented[own].flatten(0, 1)
+            torch.mm(points, layer.distance_weights, out=correlations.view(len(points), -1))
+            torch.mm(points, layer.feature_weights, out=waves.view(len(points), -1))
+            correlation_(self._kernel, correlations, decay)
+            torch.bmm(waves.cos_(), feature_out[own], out=out[own])
+            out[own].baddbmm_(correlations, kernel_out[own])
+        return out
+
+
+class _Buffers(NamedTuple):
+    """Scratch of a rollout step, allocated once per sampler."""
+
+    augmented: Float[Tensor, "P K D+2"]  # (x, |x|^2, 1)
+    correlations: Float[Tensor, "G K M"]
+    decay: Float[Tensor, "G K M"]
+    waves: Float[Tensor, "G K F"]
+
+    @classmethod
+    def allocate(cls, x: Float[Tensor, "P K D"], layer: _PathwiseLayer) -> "_Buffers":
+        """Room for G particles at a time: one on a CPU, so that its values stay in the cache; all on a GPU."""
         num_particles, num_points, size = x.shape
-        augmented, correlations, waves = self._scratch(x, layer)
-        scaled = augmented[:, :size]
-        torch.mul(x.view(-1, size), layer.inverse_lengthscale, out=scaled)
-        torch.linalg.vecdot(scaled, scaled, out=augmented[:, size])
-        torch.mm(augmented, layer.distance_weights, out=correlations)
-        torch.mm(augmented, layer.feature_weights, out=waves)
-        correlation_(self._kernel, correlations)
-        waves.cos_()
-        out = torch.bmm(waves.view(num_particles, num_points, -1), layer.feature_out[function])
-        return out.baddbmm_(correlations.view(num_particles, num_points, -1), layer.kernel_out[function])
-
-    def _scratch(self, x: Tensor, layer: _PathwiseLayer) -> tuple[Tensor, Tensor, Tensor]:
-        """Buffers of one layer's evaluation, allocated at the first step of a rollout of this size."""
-        rows = x.shape[0] * x.shape[1]
-        if self._buffers is None or self._buffers[0].shape[0] != rows:
-            self._buffers = (
-                x.new_ones(rows, x.shape[2] + 2),
-                x.new_empty(rows, layer.distance_weights.shape[1]),
-                x.new_empty(rows, layer.feature_weights.shape[1]),
-            )
-        return self._buffers
+        group = 1 if x.device.type == "cpu" else num_particles
+        num_inducing, num_features = layer.distance_weights.shape[1], layer.feature_weights.shape[1]
+        return cls(
+            x.new_ones(num_particles, num_points, size + 2),
+            x.new_empty(group, num_points, num_inducing),
+            x.new_empty(group, num_points, num_inducing),
+            x.new_empty(group, num_points, num_features),
+        )

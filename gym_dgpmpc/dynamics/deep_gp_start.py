@@ -28,15 +28,15 @@ def initial_model(data: Data, num_layers: int, num_inducing: int, generator: tor
     Inducing inputs by k-means of the inputs, in every layer (the inner layers start near the identity); lengthscales
     sqrt(D); kernel variance 0.01 in the inner layers and 1 in the last; noise variance 0.05 of a target's.
     """
-    size, options = data.x.shape[1], {"dtype": data.x.dtype, "device": data.x.device}
+    size = data.x.shape[1]
     centres = cluster(data.x, num_inducing, generator)
-    log_lengthscale = torch.full((size,), 0.5 * math.log(size), **options)
+    log_lengthscale = data.x.new_full((size,), 0.5 * math.log(size))
 
     def layer(variance: float) -> Layer:
-        return Layer(centres.clone(), log_lengthscale.clone(), torch.tensor(math.log(variance), **options))
+        return Layer(centres.clone(), log_lengthscale.clone(), data.x.new_tensor(math.log(variance)))
 
     layers = tuple(layer(INNER_VARIANCE) for _ in range(num_layers - 1))
-    return DeepGP((*layers, layer(1.0)), torch.full((data.y.shape[1],), math.log(NOISE_VARIANCE), **options))
+    return DeepGP((*layers, layer(1.0)), data.y.new_full((data.y.shape[1],), math.log(NOISE_VARIANCE)))
 
 
 def cluster(x: Float[Tensor, "N D"], num_clusters: int, generator: torch.Generator) -> Float[Tensor, "M D"]:

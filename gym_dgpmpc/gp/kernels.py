@@ -18,6 +18,9 @@ KERNELS: tuple[Kernel, ...] = get_args(Kernel)
 # Below this r^2 two points are one: rounding of r^2 would show in Matern-1/2, and its slope there is infinite.
 _SQDIST_FLOOR = 1e-12
 
+# Range of s^2 (or of r^2 / 2) in rollouts.
+_NEAREST, _FARTHEST = 1e-36, 60.0
+
 _ORDER = {"matern12": 0.5, "matern32": 1.5, "matern52": 2.5}
 
 
@@ -30,7 +33,7 @@ def check_kernel(kernel: str) -> Kernel:
     """Return ``kernel`` if it is one of `KERNELS`; otherwise raise a ValueError that names them."""
     if kernel not in KERNELS:
         raise ValueError(f"unknown kernel {kernel!r}: expected one of {', '.join(KERNELS)}")
-    return kernel  # type: ignore[return-value]
+    return kernel
 
 
 def argument_scale(kernel: Kernel) -> float:
@@ -38,19 +41,27 @@ def argument_scale(kernel: Kernel) -> float:
     return -0.5 if kernel == "rbf" else 2 * _ORDER[kernel]
 
 
-def correlation_(kernel: Kernel, argument: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+def correlation_(
+    kernel: Kernel, argument: Float[Tensor, "*b"], scratch: Float[Tensor, "*b"] | None = None
+) -> Float[Tensor, "*b"]:
     """k with unit variance from ``argument`` = `argument_scale` * r^2, overwriting it; no gradient.
 
     The in-place form for rollouts, which fold the factor into a matrix product. Rounding that makes r^2 negative is
     taken as zero. With s = sqrt(2 nu) r: RBF exp(-r^2/2); Matern-1/2 exp(-s); Matern-3/2 (1 + s) exp(-s);
-    Matern-5/2 (1 + s + s^2/3) exp(-s) (Rasmussen and Williams 2006, eqs. 4.9 and 4.17).
+    Matern-5/2 (1 + s + s^2/3) exp(-s) (Rasmussen and Williams 2006, eqs. 4.9 and 4.17). Values below exp(-60) are
+    given as about exp(-60): single precision would make them subnormal, and products of those are a hundred times
+    slower.
+
+    Args:
+        scratch: overwritten; spares an allocation to who calls often.
     """
     if kernel == "rbf":
-        return argument.clamp_max_(0.0).exp_()
-    s = argument.clamp_min_(0.0).sqrt_()
+        return argument.clamp_(-_FARTHEST, 0.0).exp_()
+    # Exact zeros would take the vectorised square root's slow path.
+    s = argument.clamp_(_NEAREST, _FARTHEST**2).sqrt_()
     if kernel == "matern12":
         return s.neg_().exp_()
-    decay = torch.neg(s).exp_()
+    decay = torch.neg(s, out=scratch).exp_()
     if kernel == "matern32":
         return torch.addcmul(decay, s, decay, out=s)
     return s.addcmul_(s, s, value=1 / 3).add_(1.0).mul_(decay)
