@@ -78,15 +78,15 @@ LearningStarts = Annotated[
 ]
 FirstTraining = Annotated[
     int | None,
-    _training("--first-training", "Iterations of the first training.", "8000"),
+    _training("--first-training", "Iterations of the first training.", "4000"),
 ]
 Training = Annotated[
-    int | None, _training("--training", "Iterations of each later training, at every episode's start.", "1500")
+    int | None, _training("--training", "Iterations of each later training, at every episode's start.", "1000")
 ]
 NumSamples = Annotated[
     int | None, _training("--samples", "Posterior samples kept, from which a plan's worlds are drawn.", "100")
 ]
-SampleSpacing = Annotated[int | None, _training("--spacing", "Sampler steps between two kept samples.", "50")]
+SampleSpacing = Annotated[int | None, _training("--spacing", "Sampler steps between two kept samples.", "10")]
 Resample = Annotated[
     int | None, _training("--resample", "Sampler steps on the grown data after each control step.", "10", 0)
 ]

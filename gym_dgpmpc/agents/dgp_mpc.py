@@ -12,6 +12,7 @@ from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.agents.task import find_observation_spec, flat_size
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
 from gym_dgpmpc.dynamics.deep_gp_draws import Draw, Refresh
+from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.planning.cem import CEM
 from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
 
@@ -38,6 +39,10 @@ class DGPMPCAgent(MPCAgent):
         num_samples: posterior samples kept; the particles of a plan are drawn from them.
         sample_spacing: SG-HMC steps between two kept samples.
         resample_steps: SG-HMC steps after each control step; 0 keeps the posterior as it is within an episode.
+        step_size: epsilon of SG-HMC.
+        batch_size: transitions per gradient.
+        gibbs_every: training iterations between two exact draws of the last layer's inducing outputs; 0 leaves them to
+            SG-HMC alone, as in the paper.
         num_particles: P, worlds drawn for each plan.
         horizon: H, steps that a plan looks ahead.
         num_candidates: K, action sequences tried in each iteration of the planner.
@@ -74,6 +79,9 @@ class DGPMPCAgent(MPCAgent):
         "num_samples",
         "sample_spacing",
         "resample_steps",
+        "step_size",
+        "batch_size",
+        "gibbs_every",
         "horizon",
         "num_candidates",
         "num_elites",
@@ -91,11 +99,14 @@ class DGPMPCAgent(MPCAgent):
         draw: Draw = "pathwise",
         refresh: Refresh = "step",
         num_features: int = 128,
-        first_training_iterations: int = 8000,
-        training_iterations: int = 1500,
+        first_training_iterations: int = 4000,
+        training_iterations: int = 1000,
         num_samples: int = 100,
-        sample_spacing: int = 50,
+        sample_spacing: int = 10,
         resample_steps: int = 10,
+        step_size: float = 0.02,
+        batch_size: int = 256,
+        gibbs_every: int = 20,
         num_particles: int = 5,
         horizon: int = 30,
         num_candidates: int = 300,
@@ -117,6 +128,7 @@ class DGPMPCAgent(MPCAgent):
         self.draw, self.refresh, self.num_features = draw, refresh, num_features
         self.first_training_iterations, self.training_iterations = first_training_iterations, training_iterations
         self.num_samples, self.sample_spacing, self.resample_steps = num_samples, sample_spacing, resample_steps
+        self.step_size, self.batch_size, self.gibbs_every = step_size, batch_size, gibbs_every
         self.horizon, self.num_candidates = horizon, num_candidates
         self.num_elites, self.num_iterations = num_elites, num_iterations
         self.observation_spec = observation_spec
@@ -165,6 +177,9 @@ class DGPMPCAgent(MPCAgent):
             num_samples=self.num_samples,
             sample_spacing=self.sample_spacing,
             resample_steps=self.resample_steps,
+            inference=InferenceSettings(
+                step_size=self.step_size, batch_size=self.batch_size, gibbs_every=self.gibbs_every
+            ),
             device=self.device,
         )
         super()._setup_model()

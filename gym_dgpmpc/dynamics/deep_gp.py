@@ -7,6 +7,7 @@ control step and `draw` for each plan.
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -64,6 +65,7 @@ class DeepGPDynamics:
         num_samples: size of the pool of posterior samples.
         sample_spacing: SG-HMC steps between two samples of the pool.
         resample_steps: SG-HMC steps of one `resample`; 0 leaves the posterior as it is within an episode.
+        resample_samples: samples of the pool that one `resample` replaces, if the last layer is drawn exactly.
         relocate: move the inducing inputs to the grown data's cluster centres before each later fit.
         inference: settings of the sampler and the optimiser.
         dtype: precision of rollouts; training and every factorisation are in float64.
@@ -85,11 +87,12 @@ class DeepGPDynamics:
         draw: Draw = "pathwise",
         refresh: Refresh = "step",
         num_features: int = 128,
-        first_iterations: int = 8000,
-        iterations: int = 1500,
+        first_iterations: int = 4000,
+        iterations: int = 1000,
         num_samples: int = 100,
-        sample_spacing: int = 50,
+        sample_spacing: int = 10,
         resample_steps: int = 10,
+        resample_samples: int = 5,
         relocate: bool = True,
         inference: InferenceSettings | None = None,
         dtype: torch.dtype = torch.float32,
@@ -119,7 +122,7 @@ class DeepGPDynamics:
         self.draw_kind, self.refresh = draw, refresh
         self.first_iterations, self.iterations = first_iterations, iterations
         self.num_samples, self.sample_spacing, self.resample_steps = num_samples, sample_spacing, resample_steps
-        self.relocate = relocate
+        self.relocate, self.resample_samples = relocate, min(resample_samples, num_samples)
         self.inference = inference or InferenceSettings()
         self.device = torch.device(device)
         self.dtype = dtype
@@ -179,19 +182,20 @@ class DeepGPDynamics:
             return {}
         x, y = self._encode(data)
         standardised = Data(fitted.normalisers[0](x), fitted.normalisers[1](y))
+        kernel, model, factors, settings = self.kernel, fitted.model, self._factors, self.inference
+        without_gibbs = replace(settings, gibbs_every=0)
         (chain,) = mcem.sample(
-            self.kernel,
-            fitted.model,
-            fitted.chain,
-            standardised,
-            1,
-            self.resample_steps,
-            generator,
-            self.inference,
-            self._factors,
+            kernel, model, fitted.chain, standardised, 1, self.resample_steps, generator, without_gibbs, factors
         )
-        fitted.pool[fitted.oldest] = chain.position
-        self._fitted = fitted._replace(chain=chain, oldest=(fitted.oldest + 1) % self.num_samples)
+        newest = chain.position.unsqueeze(0)
+        if settings.gibbs_every:
+            newest = mcem.gibbs_positions(
+                kernel, model, factors, chain, standardised, self.resample_samples, generator, settings
+            )
+            chain = chain._replace(position=newest[-1])
+        rows = (fitted.oldest + torch.arange(len(newest))) % self.num_samples
+        fitted.pool[rows] = newest
+        self._fitted = fitted._replace(chain=chain, oldest=(fitted.oldest + len(newest)) % self.num_samples)
         return {}
 
     def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:

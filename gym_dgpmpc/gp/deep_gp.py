@@ -48,6 +48,10 @@ class DeepGP(NamedTuple):
             layer.inducing_inputs.shape[0] * o for layer, o in zip(self.layers, self.output_sizes(), strict=True)
         )
 
+    def num_inner(self) -> int:
+        """How many of them belong to the inner layers, which come first."""
+        return self.num_whitened() - self.layers[-1].inducing_inputs.shape[0] * self.log_noise.numel()
+
     def parameters(self) -> list[Tensor]:
         """The tensors that the hyperparameter optimiser moves."""
         return [tensor for layer in self.layers for tensor in layer] + [self.log_noise]
@@ -70,12 +74,25 @@ def propagate(
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, "*p n T"], Float[Tensor, "*p n"]]:
     """Mean and variance of the last layer, given one sample through each inner layer (its marginals)."""
+    x = propagate_inner(kernel, model, factors, whitened, x, generator)
+    return conditional(kernel, model.layers[-1], factors[-1], whitened[-1], x)
+
+
+def propagate_inner(
+    kernel: Kernel,
+    model: DeepGP,
+    factors: list[Tensor],
+    whitened: list[Tensor],
+    x: Float[Tensor, "*p n D"],
+    generator: torch.Generator,
+) -> Float[Tensor, "*p n D"]:
+    """What the last layer is fed: one sample through each inner layer (its marginals); ``x`` itself if L = 1."""
     for layer, factor, v in zip(model.layers[:-1], factors[:-1], whitened[:-1], strict=True):
         mean, variance = conditional(kernel, layer, factor, v, x)
         noise = torch.randn(mean.shape, generator=generator, dtype=x.dtype, device=x.device)
         # The floor keeps the square root's gradient finite where the variance vanishes.
         x = x + mean + variance.clamp_min(1e-12).sqrt().unsqueeze(-1) * noise
-    return conditional(kernel, model.layers[-1], factors[-1], whitened[-1], x)
+    return x
 
 
 def log_likelihood(

@@ -52,7 +52,7 @@ def conditional(
 
     mean = k_xz L_z^-T v, variance = k_xx - |L_z^-1 k_zx|^2, the same for every output.
     """
-    projected = _project(kernel, layer, factor, x)
+    projected = project(kernel, layer, factor, x)
     # The kernel's variance enters here and not in the large matrix, which training differentiates through.
     variance = layer.variance * (1.0 - layer.variance * projected.square().sum(-2))
     return layer.variance * (projected.mT @ whitened), variance.clamp_min(0.0)
@@ -66,13 +66,13 @@ def joint_conditional(
     x: Float[Tensor, "*p n D"],
 ) -> tuple[Float[Tensor, "*p n O"], Float[Tensor, "*p n n"]]:
     """As `conditional`, with the full covariance of the n points: k_xx' - k_xz K_zz^-1 k_zx'."""
-    projected = _project(kernel, layer, factor, x)
+    projected = project(kernel, layer, factor, x)
     prior = correlation(kernel, pairwise_sqdist(x / layer.lengthscale))
     covariance = layer.variance * (prior - layer.variance * (projected.mT @ projected))
     return layer.variance * (projected.mT @ whitened), covariance
 
 
-def _project(kernel: Kernel, layer: Layer, factor: Tensor, x: Tensor) -> Tensor:
+def project(kernel: Kernel, layer: Layer, factor: Tensor, x: Tensor) -> Tensor:
     """L_z^-1 k_zx / sigma^2 "*p M n"."""
     unit = correlation(kernel, scaled_sqdist(x, layer.inducing_inputs, layer.lengthscale))
     return torch.linalg.solve_triangular(factor, unit.mT, upper=False)

@@ -2,7 +2,8 @@
 
 Works on one batch of standardised inputs and targets; `dynamics/deep_gp.py` prepares them and keeps the results.
 The E-step is one SG-HMC step; the M-step is one Adam step on the hyperparameters, inducing inputs and noise under a
-sample drawn uniformly from the window of the latest SG-HMC positions (Havasi et al. 2018, algorithm 1).
+sample drawn uniformly from the window of the latest SG-HMC positions (Havasi et al. 2018, algorithm 1). Now and then
+the last layer is drawn exactly (`last_layer.py`), which is not in the paper.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from torch import Tensor
 from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all, log_likelihood, propagate
 from gym_dgpmpc.gp.kernels import Kernel
 from gym_dgpmpc.inference import sghmc
+from gym_dgpmpc.inference.last_layer import last_layer_posterior
 from gym_dgpmpc.inference.sghmc import SGHMCState
 
 
@@ -29,6 +31,12 @@ class InferenceSettings:
         learning_rate: of Adam.
         window_size: number of latest positions the M-step draws from.
         batch_size: observations per gradient; all of them where there are fewer.
+        gibbs_every: training iterations between two exact draws of the last layer, which each kept sample gets too;
+            0 leaves everything to SG-HMC.
+        gibbs_rows: observations that such a draw is conditioned on; all of them where there are fewer.
+
+    Raises:
+        ValueError: a setting is out of its range.
     """
 
     step_size: float = 0.02
@@ -36,6 +44,17 @@ class InferenceSettings:
     learning_rate: float = 0.01
     window_size: int = 100
     batch_size: int = 256
+    gibbs_every: int = 20
+    gibbs_rows: int = 4096
+
+    def __post_init__(self) -> None:
+        for name in ("step_size", "learning_rate", "window_size", "batch_size", "gibbs_rows"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, received {getattr(self, name)}")
+        if not 0.0 <= self.decay <= 1.0:
+            raise ValueError(f"decay must lie in [0, 1], received {self.decay}")
+        if self.gibbs_every < 0:
+            raise ValueError(f"gibbs_every must be at least 0, received {self.gibbs_every}")
 
 
 class Data(NamedTuple):
@@ -124,6 +143,9 @@ def train(
         chain = sghmc.step(
             chain, gradient, num_data, generator, step_size=settings.step_size, decay=settings.decay, burn_in=True
         )
+        if settings.gibbs_every and iteration % settings.gibbs_every == 0:
+            detached = [f.detach() for f in factors]
+            chain = gibbs_step(kernel, live.detach(), detached, chain, data, generator, settings)
         window[iteration % settings.window_size] = chain.position
 
         # M-step: move the hyperparameters under a sample from the window.
@@ -163,7 +185,43 @@ def sample(
             chain = sghmc.step(
                 chain, gradient, num_data, generator, step_size=settings.step_size, decay=settings.decay, burn_in=False
             )
+        if settings.gibbs_every:
+            chain = gibbs_step(kernel, model, factors, chain, data, generator, settings)
         yield chain
+
+
+def gibbs_step(
+    kernel: Kernel,
+    model: DeepGP,
+    factors: list[Tensor],
+    chain: SGHMCState,
+    data: Data,
+    generator: torch.Generator,
+    settings: InferenceSettings,
+) -> SGHMCState:
+    """Draw the last layer's inducing outputs exactly, given the inner layers', and bring them to rest there."""
+    (position,) = gibbs_positions(kernel, model, factors, chain, data, 1, generator, settings)
+    at_rest = chain.momentum.clone()
+    at_rest[model.num_inner() :] = 0.0
+    return chain._replace(position=position, momentum=at_rest)
+
+
+def gibbs_positions(
+    kernel: Kernel,
+    model: DeepGP,
+    factors: list[Tensor],
+    chain: SGHMCState,
+    data: Data,
+    num_samples: int,
+    generator: torch.Generator,
+    settings: InferenceSettings,
+) -> Float[Tensor, "n V"]:
+    """Positions that share the chain's inner layers, each with its own exact draw of the last layer."""
+    rows = data.minibatch(settings.gibbs_rows, generator)
+    weight = len(data.x) / len(rows.x)
+    posterior = last_layer_posterior(kernel, model, factors, chain.position, rows.x, rows.y, generator, weight)
+    drawn = posterior.sample(num_samples, generator).flatten(1)
+    return torch.cat([chain.position[: model.num_inner()].expand(num_samples, -1), drawn], dim=1)
 
 
 def _rebuild(model: DeepGP, parameters: list[Tensor]) -> DeepGP:

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.planning.rollout import rollout
 from gym_dgpmpc.types import DynamicsModel, ObservationSpec, Transitions
 from tests.oracles import pendulum
@@ -106,17 +107,22 @@ def test_an_unfitted_model_says_so(verb):
             tiny().resample(pendulum.simulate(3), seeded())
 
 
-def test_resampling_replaces_the_oldest_row_of_the_pool_and_nothing_else():
-    model, generator = fitted(), seeded(3)
+@pytest.mark.parametrize("gibbs_every", [20, 0])
+def test_resampling_replaces_the_oldest_rows_of_the_pool_and_nothing_else(gibbs_every):
+    num = 3 if gibbs_every else 1  # SG-HMC alone gives one position
+    settings = InferenceSettings(gibbs_every=gibbs_every)
+    model, generator = fitted(num_samples=4, resample_samples=3, inference=settings), seeded(3)
     before = {name: torch.as_tensor(value).clone() for name, value in model.state_dict().items()}
-    pool = before["pool"]
-    for count in range(1, 6):  # once around the ring of four, and one more
+    pool, oldest = before["pool"], 0
+    for count in range(1, 6):  # around the ring of four and further
         model.resample(pendulum.simulate(30 + count), generator)
         state = model.state_dict()
         changed = (state["pool"] != pool).any(dim=1).nonzero().flatten().tolist()
-        assert changed == [(count - 1) % 4]
-        assert state["oldest"] == count % 4
-        assert torch.equal(state["pool"][changed[0]], state["chain.position"])
+        assert changed == sorted((oldest + i) % 4 for i in range(num))
+        newest = (oldest + num - 1) % 4
+        oldest = (oldest + num) % 4
+        assert state["oldest"] == oldest
+        assert torch.equal(state["pool"][newest], state["chain.position"])
         pool = state["pool"].clone()
         moved = {name for name, value in before.items() if not torch.equal(torch.as_tensor(state[name]), value)}
         assert moved - {"oldest"} == {"pool", "chain.position", "chain.momentum"}
