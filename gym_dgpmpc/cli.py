@@ -8,6 +8,7 @@ import importlib.metadata
 import inspect
 import os
 import time
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import Enum
@@ -229,8 +230,14 @@ def _one_line_errors(*expected: type[Exception]) -> Iterator[None]:
     try:
         yield
     except kinds as error:
-        typer.echo(f"error: {' '.join(str(error).split()) or type(error).__name__}", err=True)
+        typer.echo(f"error: {' '.join(str(error).split()) or _where(error)}", err=True)
         raise typer.Exit(EXIT_ERROR) from error
+
+
+def _where(error: Exception) -> str:
+    """Kind and place of an error that says nothing, such as a bare assertion in an environment."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__} at {last.filename}:{last.lineno}: {last.line}"
 
 
 def _plain(**arguments: Any) -> dict[str, Any]:

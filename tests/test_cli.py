@@ -18,7 +18,7 @@ from gym_dgpmpc.agents.presets import PAPER
 from gym_dgpmpc.dynamics.deep_gp_draws import DRAWS, REFRESHES
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.reporting import rendering
-from tests.reporting.toy import ENV_ID
+from tests.reporting.toy import ENV_ID, ToyPush
 
 SMALLEST = ["--layers=1", "--inducing=4", "--features=4", "--particles=2", "--horizon=3", "--candidates=6"]
 SMALLEST += ["--iterations=1", "--first-training=2", "--training=2", "--samples=2", "--spacing=1", "--resample=0"]
@@ -149,6 +149,14 @@ def test_interruption(run, monkeypatch):
 def test_train_says_what_is_wrong(run, tmp_path, arguments, texts):
     assert is_one_line_error(run("train", *arguments, "--no-video"), *texts)
     assert not list(tmp_path.rglob("*.*"))
+
+
+def test_an_error_without_words_says_where_it_was(run, monkeypatch):
+    def fail(*args, **kwargs):
+        raise AssertionError
+
+    monkeypatch.setattr(ToyPush, "__init__", fail)
+    assert is_one_line_error(run("train", "ToyPush-v0", "--no-video"), "AssertionError at ", "test_cli.py", "raise AssertionError")
 
 
 @pytest.mark.parametrize("option", ["--layers=0", "--kernel=linear", "--draw=x", "--episodes=0", "--seed=-1"])
