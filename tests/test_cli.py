@@ -156,7 +156,9 @@ def test_an_error_without_words_says_where_it_was(run, monkeypatch):
         raise AssertionError
 
     monkeypatch.setattr(ToyPush, "__init__", fail)
-    assert is_one_line_error(run("train", "ToyPush-v0", "--no-video"), "AssertionError at ", "test_cli.py", "raise AssertionError")
+    assert is_one_line_error(
+        run("train", "ToyPush-v0", "--no-video"), "AssertionError at ", "test_cli.py", "raise AssertionError"
+    )
 
 
 @pytest.mark.parametrize("option", ["--layers=0", "--kernel=linear", "--draw=x", "--episodes=0", "--seed=-1"])
