@@ -67,8 +67,10 @@ def correlation_(
     return s.addcmul_(s, s, value=1 / 3).add_(1.0).mul_(decay)
 
 
-def _correlation_and_slope(kernel: Kernel, sqdist: Tensor) -> tuple[Tensor, Tensor]:
-    """k(r^2) and dk/d(r^2) with unit variance."""
+def correlation_and_slope(
+    kernel: Kernel, sqdist: Float[Tensor, "*b"]
+) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+    """k(r^2) and dk/d(r^2) with unit variance; no gradient flows through."""
     if kernel == "rbf":
         value = torch.exp(-0.5 * sqdist.clamp_min(0.0))
         return value, -0.5 * value
@@ -86,7 +88,7 @@ def _correlation_and_slope(kernel: Kernel, sqdist: Tensor) -> tuple[Tensor, Tens
 class _Correlation(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, sqdist: Tensor, kernel: Kernel) -> Tensor:
-        value, slope = _correlation_and_slope(kernel, sqdist)
+        value, slope = correlation_and_slope(kernel, sqdist)
         ctx.save_for_backward(slope)
         return value
 
@@ -104,11 +106,15 @@ def correlation(kernel: Kernel, sqdist: Float[Tensor, "*b"]) -> Float[Tensor, "*
 def scaled_sqdist(
     x: Float[Tensor, "*b n D"], z: Float[Tensor, "m D"], lengthscale: Float[Tensor, "D"]
 ) -> Float[Tensor, "*b n m"]:
-    """r^2 between the rows of ``x`` and ``z``; may be negative by rounding.
+    """r^2 between the rows of ``x`` and ``z``; may be negative by rounding."""
+    return sqdist(x / lengthscale, z / lengthscale)
+
+
+def sqdist(x: Float[Tensor, "*b n D"], z: Float[Tensor, "m D"]) -> Float[Tensor, "*b n m"]:
+    """|x_i - z_j|^2 between the rows of ``x`` and ``z``; may be negative by rounding.
 
     One matrix product of (x, |x|^2, 1) and (-2 z, 1, |z|^2), so that no other operation has the size of the result.
     """
-    x, z = x / lengthscale, z / lengthscale
     left = torch.cat([x, x.square().sum(-1, keepdim=True), torch.ones_like(x[..., :1])], dim=-1)
     right = torch.cat([-2.0 * z, torch.ones_like(z[..., :1]), z.square().sum(-1, keepdim=True)], dim=-1)
     return left @ right.mT

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gym_dgpmpc.gp.kernels import Kernel, correlation, pairwise_sqdist, scaled_sqdist
 from gym_dgpmpc.gp.linalg import cholesky
+from gym_dgpmpc.gp.projection import projection
 
 
 class Layer(NamedTuple):
@@ -54,8 +55,8 @@ def conditional(
     """
     projected = project(kernel, layer, factor, x)
     # The kernel's variance enters here and not in the large matrix, which training differentiates through.
-    variance = layer.variance * (1.0 - layer.variance * projected.square().sum(-2))
-    return layer.variance * (projected.mT @ whitened), variance.clamp_min(0.0)
+    variance = layer.variance * (1.0 - projected.square().sum(-2))
+    return layer.variance.sqrt() * (projected.mT @ whitened), variance.clamp_min(0.0)
 
 
 def joint_conditional(
@@ -68,11 +69,19 @@ def joint_conditional(
     """As `conditional`, with the full covariance of the n points: k_xx' - k_xz K_zz^-1 k_zx'."""
     projected = project(kernel, layer, factor, x)
     prior = correlation(kernel, pairwise_sqdist(x / layer.lengthscale))
-    covariance = layer.variance * (prior - layer.variance * (projected.mT @ projected))
-    return layer.variance * (projected.mT @ whitened), covariance
+    covariance = layer.variance * (prior - projected.mT @ projected)
+    return layer.variance.sqrt() * (projected.mT @ whitened), covariance
 
 
-def project(kernel: Kernel, layer: Layer, factor: Tensor, x: Tensor) -> Tensor:
-    """L_z^-1 k_zx / sigma^2 "*p M n"."""
-    unit = correlation(kernel, scaled_sqdist(x, layer.inducing_inputs, layer.lengthscale))
-    return torch.linalg.solve_triangular(factor, unit.mT, upper=False)
+def project(
+    kernel: Kernel, layer: Layer, factor: Float[Tensor, "M M"], x: Float[Tensor, "*p n D"]
+) -> Float[Tensor, "*p M n"]:
+    """L_z^-1 k_zx / sigma, of which every column has a length of at most one.
+
+    Args:
+        factor: `factorise` of this very layer. Gradients with respect to the layer are complete without any flowing
+            through the factor; it may have been computed without gradients.
+    """
+    lengthscale = layer.lengthscale
+    unit = (factor / layer.variance.sqrt()).detach()
+    return projection(kernel, x / lengthscale, layer.inducing_inputs / lengthscale, unit)

@@ -54,7 +54,7 @@ def last_layer_posterior(
     """
     last = model.layers[-1]
     hidden = propagate_inner(kernel, model, factors, model.split(whitened), x, generator)
-    a = last.variance * project(kernel, last, factors[-1], hidden)
+    a = last.variance.sqrt() * project(kernel, last, factors[-1], hidden)
     variance = (last.variance - a.square().sum(0)).clamp_min(0.0)
     weights = weight / (variance + model.noise_variance.unsqueeze(-1))
     weighted = a * weights.unsqueeze(1)

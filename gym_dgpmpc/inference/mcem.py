@@ -134,18 +134,16 @@ def train(
     value = chain.position.new_zeros(())
     for iteration in range(num_iterations):
         batch = data.minibatch(settings.batch_size, generator)
-        factors = factorise_all(kernel, live)
+        with torch.no_grad():  # gradients do not need it: see `layer.project`
+            factors = factorise_all(kernel, live)
 
         # E-step: move the inducing outputs under the current hyperparameters.
-        value, gradient = _gradient(
-            kernel, live.detach(), [f.detach() for f in factors], chain, batch, num_data, generator
-        )
+        value, gradient = _gradient(kernel, live.detach(), factors, chain, batch, num_data, generator)
         chain = sghmc.step(
             chain, gradient, num_data, generator, step_size=settings.step_size, decay=settings.decay, burn_in=True
         )
         if settings.gibbs_every and iteration % settings.gibbs_every == 0:
-            detached = [f.detach() for f in factors]
-            chain = gibbs_step(kernel, live.detach(), detached, chain, data, generator, settings)
+            chain = gibbs_step(kernel, live.detach(), factors, chain, data, generator, settings)
         window[iteration % settings.window_size] = chain.position
 
         # M-step: move the hyperparameters under a sample from the window.

@@ -1,0 +1,69 @@
+"""L^-1 k(Z, x), the one large product that every sparse-GP formula needs, with its gradient in closed form.
+
+`layer.py` builds means and variances from it. Automatic differentiation through the covariance, its Cholesky
+factorisation and the triangular solve costs several times the forward pass; the closed form shares one factorisation
+between all uses of an iteration and needs two solves of the forward's size.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gym_dgpmpc.gp.kernels import Kernel, correlation_and_slope, sqdist
+
+
+class _Projection(torch.autograd.Function):
+    """A = L^-1 r(Z, x) with L L^T = r(Z, Z) + jitter, as a function of x and Z (both over the lengthscales).
+
+    With a bar for the gradient of the loss: r_bar = L^-T A_bar, and through the factor (Murray 2016, eq. 8, where
+    L^T L_bar = -A_bar A^T in its lower triangle) K_bar = -sym(L^-T Phi(A_bar A^T) L^-1), Phi taking the lower triangle
+    with half the diagonal.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, z: Tensor, factor: Tensor, kernel: Kernel) -> Tensor:
+        value, slope = correlation_and_slope(kernel, sqdist(x, z))
+        projected = torch.linalg.solve_triangular(factor, value.mT, upper=False)
+        ctx.save_for_backward(x, z, factor, slope, projected)
+        ctx.kernel = kernel
+        return projected
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+        (gradient,) = grad_outputs
+        x, z, factor, slope, projected = ctx.saved_tensors
+        by_distance = torch.linalg.solve_triangular(factor.mT, gradient, upper=True).mT * slope  # "*p n M"
+        x_bar = z_bar = None
+        if ctx.needs_input_grad[0]:
+            x_bar = 2.0 * (by_distance.sum(-1, keepdim=True) * x - by_distance @ z)
+        if ctx.needs_input_grad[1]:
+            points = by_distance.sum(-2).unsqueeze(-1) * z - by_distance.mT @ x
+            outer = gradient @ projected.mT
+            leading = tuple(range(gradient.ndim - 2))
+            if leading:
+                points, outer = points.sum(leading), outer.sum(leading)
+            lower = outer.tril()
+            lower.diagonal().mul_(0.5)
+            inner = torch.linalg.solve_triangular(factor.mT, lower, upper=True)
+            covariance_bar = -torch.linalg.solve_triangular(factor, inner, upper=False, left=False)
+            symmetric = 0.5 * (covariance_bar + covariance_bar.mT)
+            by_own_distance = symmetric * correlation_and_slope(ctx.kernel, sqdist(z, z))[1]
+            # Each inducing input is on both sides of its own distances, hence twice.
+            own = by_own_distance.sum(-1, keepdim=True) * z - by_own_distance @ z
+            z_bar = 2.0 * points + 4.0 * own
+        return x_bar, z_bar, None, None
+
+
+def projection(
+    kernel: Kernel, x: Float[Tensor, "*p n D"], z: Float[Tensor, "M D"], factor: Float[Tensor, "M M"]
+) -> Float[Tensor, "*p M n"]:
+    """L^-1 r(Z, x), differentiable once in ``x`` and ``z``.
+
+    Args:
+        x, z: points and inducing inputs, divided by the lengthscales.
+        factor: L, the Cholesky factor of r(Z, Z) + jitter *for this z*. No gradient flows into it: its dependence on
+            ``z`` is part of the gradient of ``z``.
+    """
+    return _Projection.apply(x, z, factor, kernel)
