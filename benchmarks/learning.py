@@ -58,11 +58,18 @@ def perform(run: Run, folder: Path, results: Path, episodes: int) -> bool:
         print(f"{run.name} failed with exit code {code}; see {log.name}", file=sys.stderr)
         return False
     results.mkdir(parents=True, exist_ok=True)
-    settings = json.loads((folder / run.name / "settings.json").read_text())
+    settings = json.loads((folder / run.name / "settings.json").read_text()) | {"commit": commit()}
     (results / f"{run.name}.json").write_text(json.dumps(settings, indent=2) + "\n")
     shutil.copyfile(folder / run.name / "episodes.csv", results / f"{run.name}.csv")
     print(f"{run.name}: mean {statistics.mean(returns_of(results, run)):.2f}", flush=True)
     return True
+
+
+def commit() -> str:
+    """The revision of the code that ran, as far as git knows it."""
+    asked = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40"]
+    answer = subprocess.run(asked, capture_output=True, text=True, check=False)
+    return answer.stdout.strip() or "unknown"
 
 
 def returns_of(results: Path, run: Run) -> list[float]:
