@@ -66,10 +66,14 @@ def perform(run: Run, folder: Path, results: Path, episodes: int) -> bool:
 
 
 def commit() -> str:
-    """The revision of the code that ran, as far as git knows it."""
-    asked = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40"]
-    answer = subprocess.run(asked, capture_output=True, text=True, check=False)
-    return answer.stdout.strip() or "unknown"
+    """The revision of the package that ran, marked if the package differs from it; results do not count."""
+    here = Path(__file__).parents[1]
+
+    def git(*arguments: str) -> "subprocess.CompletedProcess[str]":
+        return subprocess.run(["git", "-C", str(here), *arguments], capture_output=True, text=True, check=False)
+
+    revision = git("rev-parse", "HEAD").stdout.strip() or "unknown"
+    return revision + ("-dirty" if git("diff", "--quiet", "HEAD", "--", "gym_dgpmpc").returncode else "")
 
 
 def returns_of(results: Path, run: Run) -> list[float]:
