@@ -80,6 +80,17 @@ class TransitionSampler(Protocol):
 
 
 @runtime_checkable
+class TrajectorySampler(TransitionSampler, Protocol):
+    """A `TransitionSampler` that can take whole action sequences at once, faster than step by step."""
+
+    def trajectories(
+        self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]
+    ) -> Float[Tensor, "H_plus_1 P K S"]:
+        """What repeated calls from ``observation`` give; ``states[0]`` is the observation itself."""
+        ...
+
+
+@runtime_checkable
 class DynamicsModel(Protocol):
     """Learns from transitions and draws plausible worlds."""
 

@@ -50,6 +50,8 @@ class DGPMPCAgent(MPCAgent):
         num_iterations: the most iterations of a plan.
         actions_per_plan: actions performed of each plan before the next one is made.
         learning_starts: environment steps of uniform random actions; default: those of one episode.
+        compile: roll plans out in compiled code, which a C++ compiler builds once in a few seconds; without one, or on
+            another device than the CPU, PyTorch does it, several times slower. Not saved with the agent.
         reward_fn: r(s, a, s'), batched over leading dimensions, in torch; default: the environment's ``reward_fn``.
         terminated_fn: whether an episode ends in s', batched likewise; default: the environment's ``terminated_fn``.
         observation_spec: how the model reads observations; default: the environment's ``observation_spec``.
@@ -114,6 +116,7 @@ class DGPMPCAgent(MPCAgent):
         num_iterations: int = 5,
         actions_per_plan: int = 1,
         learning_starts: int | None = None,
+        compile: bool = True,
         reward_fn: RewardFn | None = None,
         terminated_fn: TerminatedFn | None = None,
         observation_spec: ObservationSpec | None = None,
@@ -131,7 +134,7 @@ class DGPMPCAgent(MPCAgent):
         self.step_size, self.batch_size, self.gibbs_every = step_size, batch_size, gibbs_every
         self.horizon, self.num_candidates = horizon, num_candidates
         self.num_elites, self.num_iterations = num_elites, num_iterations
-        self.observation_spec = observation_spec
+        self.compile, self.observation_spec = compile, observation_spec
         super().__init__(
             env,
             reward_fn=reward_fn,
@@ -180,6 +183,7 @@ class DGPMPCAgent(MPCAgent):
             inference=InferenceSettings(
                 step_size=self.step_size, batch_size=self.batch_size, gibbs_every=self.gibbs_every
             ),
+            compile=self.compile,
             device=self.device,
         )
         super()._setup_model()

@@ -20,28 +20,34 @@ class Coordinates:
         inputs: standardisation of the encoded inputs, size D.
         targets: standardisation of the targets, size T.
         dtype: precision of the rollout.
+
+    Attributes:
+        input_mean, input_scale: of the encoded inputs, [D].
+        carried, shift: the next state is carried * state + shift + what the targets add to it, [S] each.
+        spread: what one unit of each standardised target adds to its dimension of the state, [T].
     """
 
     def __init__(self, encoder: Encoder, inputs: Normaliser, targets: Normaliser, dtype: torch.dtype):
-        self._encoder = encoder
-        self._mean, self._scale = inputs.mean.to(dtype), (1.0 / inputs.std).to(dtype)
+        self.encoder = encoder
+        self.input_mean, self.input_scale = inputs.mean.to(dtype), (1.0 / inputs.std).to(dtype)
         size = encoder.observation_size
-        carried = torch.ones(size, dtype=dtype, device=self._mean.device)
-        carried[list(encoder.spec.absolute)] = 0.0
-        carried[list(encoder.spec.constant)] = 1.0
-        self._carried = None if bool((carried == 1).all()) else carried
+        self.carried = torch.ones(size, dtype=dtype, device=self.input_mean.device)
+        self.carried[list(encoder.spec.absolute)] = 0.0
+        self.carried[list(encoder.spec.constant)] = 1.0
+        self._all_carried = not encoder.spec.absolute
+        self.spread = targets.std.to(dtype)
         # One affine map from standardised targets to the observation's dimensions.
-        self._spread = torch.zeros(encoder.target_size, size, dtype=dtype, device=self._mean.device)
-        self._spread[range(encoder.target_size), encoder.predicted] = targets.std.to(dtype)
-        self._shift = torch.zeros(size, dtype=dtype, device=self._mean.device)
-        self._shift[encoder.predicted] = targets.mean.to(dtype)
+        self._spread = torch.zeros(encoder.target_size, size, dtype=dtype, device=self.input_mean.device)
+        self._spread[range(encoder.target_size), encoder.predicted] = self.spread
+        self.shift = torch.zeros(size, dtype=dtype, device=self.input_mean.device)
+        self.shift[encoder.predicted] = targets.mean.to(dtype)
 
     def encode(self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"]) -> Float[Tensor, "P K D"]:
         """Standardised model inputs."""
-        raw = self._encoder.inputs(observation, action.expand(observation.shape[0], -1, -1))
-        return raw.sub_(self._mean).mul_(self._scale)
+        raw = self.encoder.inputs(observation, action.expand(observation.shape[0], -1, -1))
+        return raw.sub_(self.input_mean).mul_(self.input_scale)
 
     def decode(self, observation: Float[Tensor, "P K S"], target: Float[Tensor, "P K T"]) -> Float[Tensor, "P K S"]:
         """The next observation from a standardised target."""
-        kept = observation if self._carried is None else observation * self._carried
-        return (target @ self._spread).add_(self._shift).add_(kept)
+        kept = observation if self._all_carried else observation * self.carried
+        return (target @ self._spread).add_(self.shift).add_(kept)

@@ -15,10 +15,12 @@ from torch import Tensor
 
 from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.dynamics import compiled_rollout
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp_draws import (
     DRAWS,
     REFRESHES,
+    CompiledPathwiseSampler,
     ConditionalSampler,
     Draw,
     PathwiseSampler,
@@ -68,6 +70,8 @@ class DeepGPDynamics:
         resample_samples: samples of the pool that one `resample` replaces, if the last layer is drawn exactly.
         relocate: move the inducing inputs to the grown data's cluster centres before each later fit.
         inference: settings of the sampler and the optimiser.
+        compile: roll pathwise draws out in compiled code, several times faster; where there is no compiler, or for
+            another precision or device, PyTorch does it.
         dtype: precision of rollouts; training and every factorisation are in float64.
         device: where tensors live.
 
@@ -95,6 +99,7 @@ class DeepGPDynamics:
         resample_samples: int = 5,
         relocate: bool = True,
         inference: InferenceSettings | None = None,
+        compile: bool = True,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ):
@@ -126,6 +131,7 @@ class DeepGPDynamics:
         self.inference = inference or InferenceSettings()
         self.device = torch.device(device)
         self.dtype = dtype
+        self.compile = compile and dtype == torch.float32 and self.device.type == "cpu"
         self._fitted: _Fitted | None = None
         self._factors: list[Tensor] = []  # L_z of every layer; derived from the hyperparameters, so not saved
 
@@ -211,9 +217,10 @@ class DeepGPDynamics:
         posterior = Posterior(self.kernel, fitted.model, self._factors, whitened)
         coordinates = Coordinates(self.encoder, *fitted.normalisers, self.dtype)
         if self.draw_kind == "pathwise":
-            return PathwiseSampler(
-                posterior, coordinates, horizon, self.num_features, self.refresh, self.dtype, generator
-            )
+            settings = posterior, coordinates, horizon, self.num_features, self.refresh
+            if self.compile and compiled_rollout.is_available():
+                return CompiledPathwiseSampler(*settings, generator)
+            return PathwiseSampler(*settings, self.dtype, generator)
         return ConditionalSampler(posterior, coordinates, generator, joint=self.draw_kind == "joint")
 
     def state_dict(self) -> StateDict:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gym_dgpmpc.types import Objective, RewardFn, TerminatedFn, TransitionSampler
+from gym_dgpmpc.types import Objective, RewardFn, TerminatedFn, TrajectorySampler, TransitionSampler
 
 
 @torch.no_grad()
@@ -33,7 +33,16 @@ def rollout(
         ValueError: the sampler's result has the wrong shape (it would be broadcast silently).
     """
     num_candidates, horizon, _ = actions.shape
-    states = observation.new_empty(horizon + 1, num_particles, num_candidates, *observation.shape)
+    expected = (horizon + 1, num_particles, num_candidates, *observation.shape)
+    if isinstance(sampler, TrajectorySampler):
+        states = sampler.trajectories(observation, actions)
+        if states.shape != expected:
+            raise ValueError(
+                f"the sampler's trajectories must have the shape [H + 1, P, K, S] = {expected}, "
+                f"got {tuple(states.shape)}"
+            )
+        return states.to(observation)
+    states = observation.new_empty(expected)
     states[0] = observation
     for step, action in enumerate(actions.to(states).transpose(0, 1).contiguous()):
         next_state = sampler(states[step], action, step)

@@ -135,6 +135,30 @@ def test_the_dtype_is_that_of_the_observation(dtype):
     assert rollout_objective(count_up, first, observation, 2)(actions).dtype == dtype
 
 
+class InOneGo:
+    """A sampler that offers trajectories; its steps must then not be asked for."""
+
+    def __init__(self, states):
+        self.states = states
+
+    def __call__(self, observation, action, step):
+        raise AssertionError("asked for a step although there are trajectories")
+
+    def trajectories(self, observation, actions):
+        return self.states
+
+
+def test_a_sampler_that_takes_whole_sequences_is_asked_once():
+    states = torch.arange(48.0).reshape(4, 2, 3, 2)
+    found = rollout(InOneGo(states), torch.zeros(2, dtype=torch.float64), torch.zeros(3, 3, 1), 2)
+    assert torch.equal(found, states.double())
+
+
+def test_trajectories_of_another_shape_are_refused():
+    with pytest.raises(ValueError, match=r"\[H \+ 1, P, K, S\] = \(4, 5, 3, 2\), got \(4, 2, 3, 2\)"):
+        rollout(InOneGo(torch.zeros(4, 2, 3, 2)), torch.zeros(2), torch.zeros(3, 3, 1), 5)
+
+
 def test_no_gradient_is_recorded():
     weight = torch.ones((), requires_grad=True)
     score = rollout_objective(lambda s, a, step: s * weight + a, first, torch.zeros(1), 2)
