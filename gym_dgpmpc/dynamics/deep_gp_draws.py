@@ -96,7 +96,10 @@ def _draw_layer(
     sigma = layer.variance.sqrt()
     prior = sigma * torch.cat([features(scaled), JITTER**0.5 * torch.eye(num_inducing).to(scaled)], dim=1)
     known = torch.linalg.solve_triangular(factor.mT, whitened.movedim(0, 1).flatten(1), upper=True)
-    response = torch.cholesky_solve(prior, factor) @ normals.to(scaled.dtype)
+    if columns < len(normals):
+        response = torch.cholesky_solve(prior @ normals.to(scaled.dtype), factor)
+    else:
+        response = torch.cholesky_solve(prior, factor) @ normals.to(scaled.dtype)
     alpha = known.unsqueeze(1) - response.unflatten(1, (num_functions, -1))
 
     def per_function(matrix: Float[Tensor, "n columns"]) -> Float[Tensor, "T P O n"]:
