@@ -23,3 +23,7 @@ class CheckpointError(DGPMPCError, ValueError):
 
 class FactorisationError(DGPMPCError, RuntimeError):
     """A covariance matrix could not be factorised even with the largest jitter."""
+
+
+class TrainingError(DGPMPCError, RuntimeError):
+    """Training diverged, and going back to the last good state with smaller steps did not help."""

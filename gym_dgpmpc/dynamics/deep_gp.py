@@ -6,7 +6,7 @@ control step and `draw` for each plan.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -31,7 +31,7 @@ from gym_dgpmpc.dynamics.deep_gp_start import initial_model, relocate, restandar
 from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
 from gym_dgpmpc.gp.kernels import Kernel, check_kernel
 from gym_dgpmpc.gp.layer import Layer
-from gym_dgpmpc.inference import mcem, sghmc
+from gym_dgpmpc.inference import mcem, sghmc, training
 from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
 from gym_dgpmpc.inference.mcem import Data, InferenceSettings
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
@@ -47,6 +47,24 @@ class _Fitted(NamedTuple):
     chain: sghmc.SGHMCState
     pool: Tensor  # "num_samples V", a ring
     oldest: int  # the row of the pool that the next sample replaces
+
+
+class _Standardised(NamedTuple):
+    """A `DataSource` that encodes and standardises only the rows that are asked for: cost independent of N."""
+
+    encode: Callable[[Transitions], tuple[Tensor, Tensor]]
+    transitions: Transitions
+    normalisers: tuple[Normaliser, Normaliser]
+
+    @property
+    def num_rows(self) -> int:
+        return self.transitions.observation.shape[0]
+
+    def rows(self, index: Tensor) -> Data:
+        # The store is on the CPU, whatever the model's device.
+        picked = index.to(self.transitions.observation.device)
+        x, y = self.encode(Transitions(*(field[picked] for field in self.transitions)))
+        return Data(self.normalisers[0](x), self.normalisers[1](y))
 
 
 class DeepGPDynamics:
@@ -142,6 +160,7 @@ class DeepGPDynamics:
 
         Raises:
             ValueError: there are no transitions.
+            TrainingError: training diverged however small its steps; the model is as it was.
         """
         x, y = self._encode(data)
         if x.shape[0] == 0:
@@ -157,28 +176,28 @@ class DeepGPDynamics:
             model, whitened = restandardise(last.model, last.chain.position, last.normalisers, normalisers)
             if self.relocate:
                 model, whitened = relocate(self.kernel, model, whitened, standardised, generator)
-        trained = mcem.train(
+        trained = training.train(
             self.kernel, model, sghmc.init(whitened), standardised, iterations, generator, self.inference
         )
-        chains = list(
-            mcem.sample(
-                self.kernel,
-                trained.model,
-                trained.chain,
-                standardised,
-                self.num_samples,
-                self.sample_spacing,
-                generator,
-                self.inference,
-            )
+        pool, chain = training.sample_pool(
+            self.kernel,
+            trained.model,
+            trained.chain,
+            standardised,
+            self.num_samples,
+            self.sample_spacing,
+            generator,
+            trained.settings,
         )
-        pool = torch.stack([chain.position for chain in chains])
-        self._fitted = _Fitted(trained.model, normalisers, chains[-1], pool, 0)
+        self._fitted = _Fitted(trained.model, normalisers, chain, pool, 0)
         self._factors = factorise_all(self.kernel, trained.model)
-        return {"negative_log_joint": trained.negative_log_joint, **self._diagnostics(self._fitted)}
+        counts = {"iterations": float(trained.num_iterations), "rollbacks": float(trained.num_rollbacks)}
+        return {"negative_log_joint": trained.negative_log_joint} | counts | self._diagnostics(self._fitted)
 
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """A few SG-HMC steps on the grown data; the newest sample takes the place of the pool's oldest.
+
+        A chain that leaves what is plausible is dropped, and the pool stays as it was.
 
         Raises:
             RuntimeError: the model was not fitted.
@@ -186,8 +205,7 @@ class DeepGPDynamics:
         fitted = self._require_fit("resample")
         if self.resample_steps == 0:
             return {}
-        x, y = self._encode(data)
-        standardised = Data(fitted.normalisers[0](x), fitted.normalisers[1](y))
+        standardised = _Standardised(self._encode, data, fitted.normalisers)
         kernel, model, factors, settings = self.kernel, fitted.model, self._factors, self.inference
         without_gibbs = replace(settings, gibbs_every=0)
         (chain,) = mcem.sample(
@@ -199,10 +217,12 @@ class DeepGPDynamics:
                 kernel, model, factors, chain, standardised, self.resample_samples, generator, settings
             )
             chain = chain._replace(position=newest[-1])
+        if not training.is_plausible(newest):
+            return {"resamplings_dropped": 1.0}
         rows = (fitted.oldest + torch.arange(len(newest))) % self.num_samples
         fitted.pool[rows] = newest
         self._fitted = fitted._replace(chain=chain, oldest=(fitted.oldest + len(newest)) % self.num_samples)
-        return {}
+        return {"resamplings_dropped": 0.0}
 
     def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
         """One sample of the pool per particle (distinct while the pool lasts), for plans of ``horizon`` steps.

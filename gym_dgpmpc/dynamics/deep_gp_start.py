@@ -18,6 +18,9 @@ from gym_dgpmpc.gp.kernels import Kernel
 from gym_dgpmpc.gp.layer import Layer, conditional, factorise
 from gym_dgpmpc.inference.mcem import Data
 
+MOST_CLUSTERED = 10_000
+"""Of more rows than this a random subset is clustered, so that the cost does not grow with the data."""
+
 INNER_VARIANCE = 0.01
 NOISE_VARIANCE = 0.05
 
@@ -29,7 +32,7 @@ def initial_model(data: Data, num_layers: int, num_inducing: int, generator: tor
     sqrt(D); kernel variance 0.01 in the inner layers and 1 in the last; noise variance 0.05 of a target's.
     """
     size = data.x.shape[1]
-    centres = cluster(data.x, num_inducing, generator)
+    centres = cluster(_clustered(data.x, generator), num_inducing, generator)
     log_lengthscale = data.x.new_full((size,), 0.5 * math.log(size))
 
     def layer(variance: float) -> Layer:
@@ -54,6 +57,12 @@ def cluster(x: Float[Tensor, "N D"], num_clusters: int, generator: torch.Generat
             x.cpu().numpy(), num_clusters, iter=10, minit="points", missing="warn", rng=np.random.default_rng(seed)
         )
     return torch.from_numpy(centres).to(x)
+
+
+def _clustered(x: Float[Tensor, "N D"], generator: torch.Generator) -> Float[Tensor, "n D"]:
+    if x.shape[0] <= MOST_CLUSTERED:
+        return x
+    return x[torch.randperm(x.shape[0], generator=generator, device=x.device)[:MOST_CLUSTERED]]
 
 
 def restandardise(
@@ -93,7 +102,7 @@ def relocate(
     New centres come from k-means of the inputs propagated by the layers' means; the new inducing outputs are the old
     conditional mean there.
     """
-    layers, parts, x = [], [], data.x
+    layers, parts, x = [], [], _clustered(data.x, generator)
     last = len(model.layers) - 1
     for index, (layer, v) in enumerate(zip(model.layers, model.split(whitened), strict=True)):
         factor = factorise(kernel, layer)

@@ -15,6 +15,7 @@ from torch import Tensor
 from gym_dgpmpc.gp.deep_gp import DeepGP, propagate_inner
 from gym_dgpmpc.gp.kernels import Kernel
 from gym_dgpmpc.gp.layer import project
+from gym_dgpmpc.gp.linalg import cholesky
 
 
 class LastLayerPosterior(NamedTuple):
@@ -58,8 +59,7 @@ def last_layer_posterior(
     variance = (last.variance - a.square().sum(0)).clamp_min(0.0)
     weights = weight / (variance + model.noise_variance.unsqueeze(-1))
     weighted = a * weights.unsqueeze(1)
-    eye = torch.eye(a.shape[0], dtype=a.dtype, device=a.device)
-    # The identity bounds the eigenvalues from below by one: no jitter is needed.
-    factor = torch.linalg.cholesky(eye + weighted @ a.mT)
+    # The identity bounds the eigenvalues from below by one.
+    factor = cholesky(weighted @ a.mT, torch.ones_like(weights[0, 0]), jitter=1.0)
     mean = torch.cholesky_solve(weighted @ y.mT.unsqueeze(-1), factor).squeeze(-1)
     return LastLayerPosterior(mean, factor)

@@ -3,7 +3,9 @@
 import pytest
 import torch
 
+from gym_dgpmpc.dynamics import deep_gp_start
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.errors import TrainingError
 from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.planning.rollout import rollout
 from gym_dgpmpc.types import DynamicsModel, ObservationSpec, Transitions
@@ -242,3 +244,45 @@ def test_a_position_outside_the_ring_is_refused(oldest):
 def test_settings_out_of_range_are_named(settings, message):
     with pytest.raises(ValueError, match=message):
         DeepGPDynamics(2, 1, pendulum.SPEC, **settings)
+
+
+def test_a_training_that_diverges_leaves_the_model_as_it_was():
+    model = fitted()
+    before = predictions(model)
+    model.inference = InferenceSettings(step_size=1e4, gibbs_every=0)
+    with pytest.raises(TrainingError):
+        model.iterations = 50
+        model.fit(pendulum.simulate(40), seeded())
+    assert torch.equal(predictions(model), before)
+
+
+def test_a_resampling_that_diverges_is_dropped():
+    model = fitted()
+    before = predictions(model)
+    model.inference = InferenceSettings(step_size=1e4, gibbs_every=0)
+    model.resample_steps = 50
+    assert model.resample(pendulum.simulate(31), seeded()) == {"resamplings_dropped": 1.0}
+    assert torch.equal(predictions(model), before)
+    model.inference = InferenceSettings()
+    assert model.resample(pendulum.simulate(31), seeded()) == {"resamplings_dropped": 0.0}
+    assert not torch.equal(predictions(model), before)
+
+
+def test_resampling_encodes_the_rows_it_needs_and_no_others():
+    """Its cost does not grow with the data: of 10,000 transitions it looks at a few minibatches."""
+    settings = InferenceSettings(batch_size=16, gibbs_rows=32)
+    model, seen = fitted(inference=settings), []
+    encode = model._encode
+    model._encode = lambda data: seen.append(len(data.action)) or encode(data)
+    many = Transitions(*(field.repeat(400, 1)[:10_000] for field in pendulum.simulate(30)))
+    model.resample(many, seeded())
+    assert seen == [16, 16, 32]
+
+
+def test_clustering_looks_at_a_bounded_number_of_rows(monkeypatch):
+    monkeypatch.setattr(deep_gp_start, "MOST_CLUSTERED", 25)
+    sizes, cluster = [], deep_gp_start.cluster
+    monkeypatch.setattr(deep_gp_start, "cluster", lambda x, *rest: sizes.append(len(x)) or cluster(x, *rest))
+    model = fitted(40)
+    model.fit(pendulum.simulate(60), seeded())
+    assert sizes == [25, 25, 25]

@@ -1,19 +1,16 @@
-"""Moving-window MCEM: its chain against the closed-form posterior, its training by what it learns."""
-
-import math
+"""Moving-window MCEM: its gradients and its chain against the closed-form posterior."""
 
 import numpy as np
 import pytest
 import scipy.stats
 import torch
 
-from gym_dgpmpc.dynamics.deep_gp_start import initial_model
 from gym_dgpmpc.gp import exact
-from gym_dgpmpc.gp.deep_gp import factorise_all, log_likelihood, propagate
+from gym_dgpmpc.gp.deep_gp import factorise_all
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.inference import mcem, sghmc
 from gym_dgpmpc.inference.diagnostics import effective_sample_size
-from gym_dgpmpc.inference.mcem import Data, InferenceSettings
+from gym_dgpmpc.inference.mcem import Data, InferenceSettings, minibatch
 from tests.oracles import sghmc as oracle
 from tests.oracles.models import make_model, normal, seeded
 
@@ -65,11 +62,11 @@ def test_minibatches_are_drawn_uniformly_and_keep_rows_together():
     rows = torch.arange(10, dtype=torch.float64).unsqueeze(1)
     data, generator, counts = Data(rows, rows + 100.0), seeded(), torch.zeros(10)
     for _ in range(2000):
-        batch = data.minibatch(4, generator)
+        batch = minibatch(data, 4, generator)
         assert batch.x.shape == (4, 1) and torch.equal(batch.y, batch.x + 100.0)
         counts += torch.bincount(batch.x.long().flatten(), minlength=10)
     assert scipy.stats.chisquare(counts.numpy()).pvalue > 1e-4
-    assert data.minibatch(10, generator) is data and data.minibatch(11, generator) is data
+    assert minibatch(data, 10, generator) is data and minibatch(data, 11, generator) is data
 
 
 @pytest.mark.parametrize(("kernel", "num_data"), [("rbf", 8), ("matern32", 24)])
@@ -121,96 +118,9 @@ def test_sampling_keeps_the_preconditioner_and_the_spacing():
     assert all(torch.equal(a.position, b.position) for a, b in zip(given, second, strict=True))
 
 
-NOISE = 0.15  # standard deviation, beside a signal of about 0.7
-
-
-def waves(num_data, seed):
-    generator = seeded(seed)
-    x = 4.0 * torch.rand(num_data, 1, generator=generator, dtype=torch.float64) - 2.0
-    y = torch.cat([torch.sin(2.0 * x), torch.tanh(2.0 * x)], dim=1)
-    return Data(x, y + NOISE * normal(generator, num_data, 2))
-
-
-def predictive_log_likelihood(kernel, model, positions, data):
-    """Mean log density of the data under the mixture over posterior samples."""
-    whitened = model.split(positions)
-    x = data.x.expand(len(positions), -1, -1)
-    mean, variance = propagate(kernel, model, factorise_all(kernel, model), whitened, x, seeded(9))
-    return (log_likelihood(model, mean, variance, data.y).logsumexp(0) - math.log(len(positions))).mean().item()
-
-
-@pytest.mark.parametrize("num_layers", [1, 2])
-def test_training_learns_the_function_and_its_noise(num_layers):
-    train, test = waves(150, 0), waves(400, 1)
-    settings = InferenceSettings(step_size=0.03, learning_rate=0.02, batch_size=100, window_size=50)
-    start = initial_model(train, num_layers, 12, seeded())
-    chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
-    generator, seen = seeded(), []
-    trained = mcem.train(
-        "matern52", start, chain, train, 500, generator, settings, progress=lambda i, value: seen.append((i, value))
-    )
-    assert [i for i, _ in seen] == list(range(500))
-    assert trained.negative_log_joint == seen[-1][1].item()
-    samples = mcem.sample("matern52", trained.model, trained.chain, train, 20, 5, generator, settings)
-    positions = torch.stack([chain.position for chain in samples])
-
-    # Knowing function and noise exactly would score -log(noise) - 1.42 for each of two targets, on average.
-    best = 2 * (-math.log(NOISE) - 0.5 * math.log(2 * math.pi * math.e))
-    before = predictive_log_likelihood("matern52", start, chain.position.unsqueeze(0), test)
-    after = predictive_log_likelihood("matern52", trained.model, positions, test)
-    assert before < best - 2.0
-    # The mean over 400 test points errs by 2^1/2 / 20; what is not known of the function costs about as much.
-    assert best - 0.25 < after < best + 0.2
-    # 150 residuals, some ten of them spent on the function, know their variance to 12 %; the last draws of a
-    # stochastic optimiser wander around it by about as much again.
-    ratio = trained.model.noise_variance / NOISE**2
-    assert ((ratio > 0.5) & (ratio < 1.7)).all()
-
-
-def test_training_moves_every_hyperparameter_and_nothing_it_was_given():
-    train = waves(30, 0)
-    start = initial_model(train, 2, 5, seeded())
-    before = [p.clone() for p in start.parameters()]
-    chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
-    trained = mcem.train("rbf", start, chain, train, 3, seeded(), InferenceSettings())
-    for kept, given, moved in zip(before, start.parameters(), trained.model.parameters(), strict=True):
-        assert torch.equal(kept, given)
-        assert moved.isfinite().all() and not torch.equal(moved, kept) and not moved.requires_grad
-    assert not chain.position.any()
-
-
-@pytest.mark.parametrize("num_data", [1, 3, 40])
-def test_the_same_seed_gives_the_same_result(num_data):
-    train, settings = waves(num_data, 0), InferenceSettings(batch_size=16)
-    results = []
-    for seed in (0, 0, 1):
-        start = initial_model(train, 2, 5, seeded(seed))
-        chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
-        results.append(mcem.train("matern12", start, chain, train, 4, seeded(seed), settings))
-    first, again, other = results
-    assert first.negative_log_joint == again.negative_log_joint
-    assert all(torch.equal(a, b) for a, b in zip(first.chain, again.chain, strict=True))
-    assert all(torch.equal(a, b) for a, b in zip(first.model.parameters(), again.model.parameters(), strict=True))
-    assert not torch.equal(first.chain.position, other.chain.position)
-
-
 def test_the_prior_weighs_less_the_more_data_there_are():
     """With a batch that repeats the same rows only |v|^2 / (2 N) changes with N."""
     model, data = one_layer()
     factors, v = factorise_all("rbf", model), normal(seeded(1), model.num_whitened())
     values = [mcem.negative_log_joint("rbf", model, factors, v, data, n, seeded()).item() for n in (8, 80)]
     assert values[0] - values[1] == pytest.approx(0.5 * v.square().sum().item() * (1 / 8 - 1 / 80), rel=1e-10)
-
-
-def test_the_window_holds_the_latest_positions_and_no_others():
-    """A window that is not yet full is used as far as it goes; one of a single position is the chain's own."""
-    train = waves(20, 0)
-    start = initial_model(train, 1, 5, seeded())
-    chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
-
-    def lengthscale(window_size):
-        settings = InferenceSettings(step_size=0.1, window_size=window_size)
-        return mcem.train("rbf", start, chain, train, 6, seeded(), settings).model.layers[0].log_lengthscale
-
-    assert torch.equal(lengthscale(6), lengthscale(600))
-    assert not torch.equal(lengthscale(6), lengthscale(1))

@@ -1,0 +1,184 @@
+"""How long to train, and what to do when training goes wrong: the loop around `mcem.MCEM.step`.
+
+Every so many iterations it looks at the run. If the run has diverged, it goes back to the last look with half the step
+size. If the likelihood of held-out data no longer improves, it stops. `dynamics/deep_gp.py` calls it once per fit.
+"""
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gym_dgpmpc.errors import FactorisationError, TrainingError
+from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all, log_likelihood, propagate
+from gym_dgpmpc.gp.kernels import Kernel
+from gym_dgpmpc.inference import mcem
+from gym_dgpmpc.inference.mcem import MCEM, Data, InferenceSettings
+from gym_dgpmpc.inference.sghmc import SGHMCState
+
+MAX_ROLLBACKS = 5
+"""In one training; the last of them trains with 1/32 of the step sizes."""
+
+EXPLODED = 1e3
+"""A negative log joint per observation this far above the lowest that was seen is a run gone wrong."""
+
+MOST_WHITENED = 1e4
+"""A whitened inducing output beyond this is a chain gone wrong."""
+
+HELD_OUT = 0.1, 256
+"""Part of the data that early stopping holds out, and the most rows."""
+
+MIN_HELD_OUT = 10
+"""With fewer rows their likelihood is too noisy to stop on, and nothing is held out."""
+
+HELD_OUT_SAMPLES = 8
+"""Positions of the window that the held-out likelihood is averaged over."""
+
+
+class Trained(NamedTuple):
+    """The outcome of `train`."""
+
+    model: DeepGP
+    chain: SGHMCState
+    negative_log_joint: float
+    """The last one, per observation, on a minibatch."""
+    num_iterations: int
+    num_rollbacks: int
+    settings: InferenceSettings
+    """Those asked for, but for the step sizes if they had to be made smaller."""
+
+
+def train(
+    kernel: Kernel,
+    model: DeepGP,
+    chain: SGHMCState,
+    data: Data,
+    num_iterations: int,
+    generator: torch.Generator,
+    settings: InferenceSettings,
+) -> Trained:
+    """Train for ``num_iterations`` iterations at most.
+
+    Args:
+        model: hyperparameters to start from; left as they are.
+        chain: where to start; its preconditioner is kept.
+        data: standardised; with early stopping a tenth of it serves to see when to stop.
+
+    Raises:
+        TrainingError: training diverged again and again, however small its steps.
+    """
+    held_out = None
+    if settings.patience is not None:
+        data, held_out = _split(data, generator)
+    run = MCEM(kernel, model, chain, data, settings)
+    good, best, rollbacks = run.snapshot(), run.evaluate(_twin(generator)), 0
+    best_likelihood, looks_since = -math.inf, 0
+    while run.iteration < num_iterations:
+        trouble = _advance(run, min(settings.look_every, num_iterations - run.iteration), generator, best)
+        if trouble is not None:
+            rollbacks += 1
+            if rollbacks > MAX_ROLLBACKS:
+                raise TrainingError(
+                    f"training diverged {rollbacks} times, the last time after iteration {good.iteration} with the "
+                    f"step size {run.settings.step_size:g}: {trouble}. Data of {data.num_rows} transitions are kept; "
+                    "see whether their values are plausible, or train with a smaller step_size"
+                )
+            run.restore(good, scale=0.5)
+            continue
+        good, best = run.snapshot(), min(best, float(run.value))
+        if held_out is not None:
+            likelihood = predictive_log_likelihood(kernel, run.model, _some(run.window, generator), held_out, generator)
+            improved = likelihood > best_likelihood
+            best_likelihood = max(best_likelihood, likelihood)
+            looks_since = 0 if improved else looks_since + 1
+            if looks_since == settings.patience:
+                break
+    return Trained(run.model, run.chain, float(run.value), run.iteration, rollbacks, run.settings)
+
+
+def sample_pool(
+    kernel: Kernel,
+    model: DeepGP,
+    chain: SGHMCState,
+    data: Data,
+    num_samples: int,
+    spacing: int,
+    generator: torch.Generator,
+    settings: InferenceSettings,
+) -> tuple[Float[Tensor, "n V"], SGHMCState]:
+    """Posterior samples ``spacing`` steps apart, and the chain at the last of them.
+
+    Begins anew with half the step size if the chain leaves what is plausible.
+
+    Raises:
+        TrainingError: it did so again and again, however small its steps.
+    """
+    factors = factorise_all(kernel, model)
+    for _ in range(MAX_ROLLBACKS + 1):
+        positions, last = [], chain
+        for last in mcem.sample(kernel, model, chain, data, num_samples, spacing, generator, settings, factors):
+            positions.append(last.position)
+        pool = torch.stack(positions)
+        if is_plausible(pool):
+            return pool, last
+        settings = replace(settings, step_size=0.5 * settings.step_size)
+    raise TrainingError(
+        f"sampling the posterior diverged {MAX_ROLLBACKS + 1} times, the last time with the step size "
+        f"{2 * settings.step_size:g}"
+    )
+
+
+def is_plausible(positions: Float[Tensor, "*n V"]) -> bool:
+    """Whether whitened inducing outputs, which are standard normal before there are data, are finite and not absurd."""
+    return bool((positions.abs() < MOST_WHITENED).all())
+
+
+def predictive_log_likelihood(
+    kernel: Kernel, model: DeepGP, positions: Float[Tensor, "n V"], data: Data, generator: torch.Generator
+) -> float:
+    """Mean log density of the data under the mixture over posterior samples."""
+    x = data.x.expand(len(positions), -1, -1)
+    with torch.no_grad():
+        factors = factorise_all(kernel, model)
+        mean, variance = propagate(kernel, model, factors, model.split(positions), x, generator)
+        density = log_likelihood(model, mean, variance, data.y).logsumexp(0) - math.log(len(positions))
+    return float(density.mean())
+
+
+def _advance(run: MCEM, num_iterations: int, generator: torch.Generator, best: float) -> str | None:
+    """Take the steps; what went wrong, or None. The host looks at the run once, at the end."""
+    try:
+        for _ in range(num_iterations):
+            run.step(generator)
+    except FactorisationError as error:
+        return str(error)
+    value = float(run.value)
+    if not math.isfinite(value) or not is_plausible(run.chain.position):
+        largest = float(run.chain.position.abs().max())
+        return f"the negative log joint is {value:g}, the largest whitened inducing output {largest:g}"
+    if value > best + EXPLODED:
+        return f"the negative log joint rose from {best:g} to {value:g} per transition"
+    return None
+
+
+def _split(data: Data, generator: torch.Generator) -> tuple[Data, Data | None]:
+    """Training data and held-out data; None where there are too few to hold any out."""
+    part, most = HELD_OUT
+    count = min(int(part * data.num_rows), most)
+    if count < MIN_HELD_OUT:
+        return data, None
+    order = torch.randperm(data.num_rows, generator=generator, device=data.x.device)
+    return data.rows(order[count:]), data.rows(order[:count])
+
+
+def _twin(generator: torch.Generator) -> torch.Generator:
+    """A generator that gives the same numbers and leaves the given one where it is."""
+    return torch.Generator(generator.device).set_state(generator.get_state())
+
+
+def _some(window: Tensor, generator: torch.Generator) -> Tensor:
+    rows = torch.randint(len(window), (HELD_OUT_SAMPLES,), generator=generator, device=window.device)
+    return window[rows]

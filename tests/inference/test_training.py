@@ -1,0 +1,228 @@
+"""Training as a whole: what it learns, when it stops, and how it recovers."""
+
+import math
+
+import pytest
+import torch
+
+from gym_dgpmpc.dynamics.deep_gp_start import initial_model
+from gym_dgpmpc.errors import FactorisationError, TrainingError
+from gym_dgpmpc.inference import mcem, sghmc, training
+from gym_dgpmpc.inference.mcem import Data, InferenceSettings
+from gym_dgpmpc.inference.training import predictive_log_likelihood, train
+from tests.oracles.models import normal, seeded
+
+NOISE = 0.15  # standard deviation, beside a signal of about 0.7
+
+
+def waves(num_data, seed):
+    generator = seeded(seed)
+    x = 4.0 * torch.rand(num_data, 1, generator=generator, dtype=torch.float64) - 2.0
+    y = torch.cat([torch.sin(2.0 * x), torch.tanh(2.0 * x)], dim=1)
+    return Data(x, y + NOISE * normal(generator, num_data, 2))
+
+
+@pytest.mark.parametrize("num_layers", [1, 2])
+def test_training_learns_the_function_and_its_noise(num_layers):
+    data, test = waves(150, 0), waves(400, 1)
+    settings = InferenceSettings(step_size=0.03, learning_rate=0.02, batch_size=100, window_size=50)
+    start = initial_model(data, num_layers, 12, seeded())
+    chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
+    generator = seeded()
+    trained = train("matern52", start, chain, data, 500, generator, settings)
+    samples = mcem.sample("matern52", trained.model, trained.chain, data, 20, 5, generator, settings)
+    positions = torch.stack([chain.position for chain in samples])
+
+    # Knowing function and noise exactly would score -log(noise) - 1.42 for each of two targets, on average.
+    best = 2 * (-math.log(NOISE) - 0.5 * math.log(2 * math.pi * math.e))
+    before = predictive_log_likelihood("matern52", start, chain.position.unsqueeze(0), test, seeded(9))
+    after = predictive_log_likelihood("matern52", trained.model, positions, test, seeded(9))
+    assert before < best - 2.0
+    # The mean over 400 test points errs by 2^1/2 / 20; what is not known of the function costs about as much.
+    assert best - 0.25 < after < best + 0.2
+    # 150 residuals, some ten of them spent on the function, know their variance to 12 %; the last draws of a
+    # stochastic optimiser wander around it by about as much again.
+    ratio = trained.model.noise_variance / NOISE**2
+    assert ((ratio > 0.5) & (ratio < 1.7)).all()
+
+
+def test_training_moves_every_hyperparameter_and_nothing_it_was_given():
+    data = waves(30, 0)
+    start = initial_model(data, 2, 5, seeded())
+    before = [p.clone() for p in start.parameters()]
+    chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
+    trained = train("rbf", start, chain, data, 3, seeded(), InferenceSettings())
+    for kept, given, moved in zip(before, start.parameters(), trained.model.parameters(), strict=True):
+        assert torch.equal(kept, given)
+        assert moved.isfinite().all() and not torch.equal(moved, kept) and not moved.requires_grad
+    assert not chain.position.any()
+
+
+@pytest.mark.parametrize("num_data", [1, 3, 40])
+def test_the_same_seed_gives_the_same_result(num_data):
+    data, settings = waves(num_data, 0), InferenceSettings(batch_size=16)
+    results = []
+    for seed in (0, 0, 1):
+        start = initial_model(data, 2, 5, seeded(seed))
+        chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
+        results.append(train("matern12", start, chain, data, 4, seeded(seed), settings))
+    first, again, other = results
+    assert first.negative_log_joint == again.negative_log_joint
+    assert all(torch.equal(a, b) for a, b in zip(first.chain, again.chain, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(first.model.parameters(), again.model.parameters(), strict=True))
+    assert not torch.equal(first.chain.position, other.chain.position)
+
+
+def test_the_window_holds_the_latest_positions_and_no_others():
+    """A window that is not yet full is used as far as it goes; one of a single position is the chain's own."""
+    data = waves(20, 0)
+    start = initial_model(data, 1, 5, seeded())
+    chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
+
+    def lengthscale(window_size):
+        settings = InferenceSettings(step_size=0.1, window_size=window_size)
+        return train("rbf", start, chain, data, 6, seeded(), settings).model.layers[0].log_lengthscale
+
+    assert torch.equal(lengthscale(6), lengthscale(600))
+    assert not torch.equal(lengthscale(6), lengthscale(1))
+
+
+def started(data, num_layers=2, num_inducing=10):
+    model = initial_model(data, num_layers, num_inducing, seeded())
+    return model, sghmc.init(torch.zeros(model.num_whitened(), dtype=torch.float64))
+
+
+def test_hyperparameters_move_as_often_as_asked():
+    data = waves(30, 0)
+    model, chain = started(data)
+    run = mcem.MCEM("rbf", model, chain, data, InferenceSettings(hyperparameters_every=3))
+    generator, moved = seeded(), []
+    for _ in range(7):
+        before = [p.clone() for p in run.model.parameters()]
+        run.step(generator)
+        moved.append(any(not torch.equal(a, b) for a, b in zip(before, run.model.parameters(), strict=True)))
+    assert moved == [False, False, True, False, False, True, False]
+
+
+def test_a_snapshot_is_everything_that_a_step_moves():
+    data = waves(30, 0)
+    model, chain = started(data)
+    run = mcem.MCEM("matern52", model, chain, data, InferenceSettings(window_size=4))
+    for _ in range(3):
+        run.step(seeded())
+    kept = run.snapshot()
+    ends = []
+    for _ in range(2):  # a snapshot survives being restored
+        for seed in range(3):
+            run.step(seeded(seed))
+        ends.append([p.clone() for p in run.model.parameters()] + [run.chain.position, run.window.clone()])
+        run.restore(kept)
+        # Restoring brings the chain to rest; for the comparison it moves as it did.
+        run.chain = kept.chain
+        assert run.iteration == 3 and run.settings.step_size == InferenceSettings().step_size
+    assert all(torch.equal(a, b) for a, b in zip(*ends, strict=True))
+    run.restore(kept, scale=0.5)
+    assert not run.chain.momentum.any()
+    assert (run.settings.step_size, run.settings.learning_rate) == (0.01, 0.005)
+    assert run._optimiser.param_groups[0]["lr"] == 0.005
+
+
+@pytest.mark.parametrize("step_size", [3.0, 10.0])
+def test_a_run_that_diverges_goes_back_and_takes_smaller_steps(step_size):
+    """Steps of 10 without exact draws explode at once; what comes out is a usable model all the same."""
+    data = waves(60, 0)
+    settings = InferenceSettings(step_size=step_size, look_every=20, gibbs_every=0)
+    trained = train("matern32", *started(data), data, 200, seeded(), settings)
+    assert 1 <= trained.num_rollbacks <= training.MAX_ROLLBACKS
+    assert trained.settings.step_size == step_size / 2**trained.num_rollbacks
+    assert trained.settings.learning_rate == settings.learning_rate / 2**trained.num_rollbacks
+    assert trained.num_iterations == 200
+    assert trained.negative_log_joint < 50.0
+    assert all(p.isfinite().all() for p in trained.model.parameters())
+    assert training.is_plausible(trained.chain.position)
+
+
+def test_a_run_that_cannot_be_saved_says_so():
+    data = waves(60, 0)
+    with pytest.raises(TrainingError, match=r"diverged 6 times.*step size 3\.125: .*60 transitions"):
+        train("matern32", *started(data), data, 100, seeded(), InferenceSettings(step_size=100.0, gibbs_every=0))
+
+
+def test_a_covariance_that_cannot_be_factorised_is_gone_back_from(monkeypatch):
+    step, count = mcem.MCEM.step, 0
+
+    def stumbling(self, generator):
+        nonlocal count
+        count += 1
+        if count == 25:
+            raise FactorisationError("this one could not")
+        step(self, generator)
+
+    monkeypatch.setattr(mcem.MCEM, "step", stumbling)
+    data = waves(20, 0)
+    trained = train("rbf", *started(data), data, 40, seeded(), InferenceSettings(look_every=10))
+    assert (trained.num_rollbacks, trained.num_iterations) == (1, 40)
+    assert count == 45, "only the steps since the last look are repeated"
+
+
+def test_without_trouble_looking_changes_nothing():
+    data = waves(30, 0)
+    ends = [
+        train("rbf", *started(data), data, 30, seeded(), InferenceSettings(look_every=look)).chain.position
+        for look in (1, 7, 100)
+    ]
+    assert torch.equal(ends[0], ends[1]) and torch.equal(ends[0], ends[2])
+
+
+def test_training_stops_when_held_out_data_say_that_it_is_enough():
+    data = waves(200, 0)
+    settings = InferenceSettings(step_size=0.03, learning_rate=0.03, patience=3, look_every=25)
+    trained = train("matern52", *started(data, 1), data, 3000, seeded(), settings)
+    assert 75 < trained.num_iterations < 1500
+    assert trained.num_iterations % 25 == 0
+    # It stopped late enough: as good as knowing function and noise, up to what 200 observations leave unknown.
+    pool, _ = training.sample_pool("matern52", trained.model, trained.chain, data, 20, 5, seeded(), trained.settings)
+    best = 2 * (-math.log(NOISE) - 0.5 * math.log(2 * math.pi * math.e))
+    found = predictive_log_likelihood("matern52", trained.model, pool, waves(400, 1), seeded())
+    assert best - 0.25 < found < best + 0.2
+    # Without patience, or with too little data to judge by, it goes on to the end.
+    for rows, patience in ((200, None), (50, 1)):
+        few = Data(data.x[:rows], data.y[:rows])
+        settings = InferenceSettings(patience=patience, look_every=5, step_size=0.03)
+        assert train("rbf", *started(few, 1), few, 30, seeded(), settings).num_iterations == 30
+
+
+def test_held_out_rows_are_not_trained_on():
+    rows = torch.arange(120, dtype=torch.float64).unsqueeze(1)
+    kept, held = training._split(Data(rows, rows + 1000), seeded())
+    assert held.num_rows == 12 and kept.num_rows == 108
+    assert sorted(torch.cat([kept.x, held.x]).flatten().tolist()) == list(range(120))
+    assert torch.equal(held.y, held.x + 1000) and torch.equal(kept.y, kept.x + 1000)
+    # Not always the same ones, and never more than it takes.
+    assert not torch.equal(training._split(Data(rows, rows), seeded(1))[1].x, held.x)
+    many = torch.zeros(10_000, 1, dtype=torch.float64)
+    assert training._split(Data(many, many), seeded())[1].num_rows == training.HELD_OUT[1]
+
+
+def test_sampling_that_diverges_begins_anew_with_smaller_steps():
+    data = waves(40, 0)
+    model, chain = started(data, 1)
+    # A preconditioner far too large for the curvature: unstable until the step has been halved a few times.
+    wild = chain._replace(square=torch.full_like(chain.square, 1e-2))
+    settings = InferenceSettings(gibbs_every=0, step_size=1.0)
+    pool, last = training.sample_pool("rbf", model, wild, data, 10, 20, seeded(), settings)
+    assert training.is_plausible(pool) and torch.equal(pool[-1], last.position)
+    with pytest.raises(
+        TrainingError, match="sampling the posterior diverged 6 times, the last time with the step size"
+    ):
+        training.sample_pool(
+            "rbf", model, wild, data, 10, 20, seeded(), InferenceSettings(gibbs_every=0, step_size=1e3)
+        )
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e9])
+def test_what_is_absurd_is_not_plausible(value):
+    positions = torch.zeros(3, 4)
+    assert training.is_plausible(positions)
+    positions[1, 2] = value
+    assert not training.is_plausible(positions)
