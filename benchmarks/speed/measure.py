@@ -1,0 +1,147 @@
+"""What is measured, each function one worker process: rows of plain values, one for each figure."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+
+from benchmarks.speed import floor, peers
+from benchmarks.speed.cases import (
+    BATCH_SIZE,
+    BY_STEP,
+    DRAWS,
+    NUM_CANDIDATES,
+    NUM_PARTICLES,
+    Case,
+    deep_gp,
+    peak_memory_mb,
+    plan_call,
+    planner,
+    random_actions,
+    reward,
+    seeded,
+    step_call,
+    timed,
+    transitions,
+)
+from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.dynamics.deep_gp_start import initial_model
+from gym_dgpmpc.inference import mcem, sghmc
+from gym_dgpmpc.inference.mcem import MCEM, Data
+from gym_dgpmpc.planning.rollout import particle_returns, rollout
+
+Row = dict[str, Any]
+
+NUM_TRANSITIONS = 600
+
+
+def plans(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
+    """A plan by each draw, and a rollout step beside GPyTorch's."""
+    data = transitions(case, NUM_TRANSITIONS)
+    steps = case.horizon * case.num_iterations
+    for name, settings in DRAWS.items():
+        model, row = deep_gp(case, num_layers, data, **settings), {"what": "plan", "how": name}
+        if name in BY_STEP:
+            by = {"by": f"one rollout step times {steps}"}
+            yield row | by | timed(step_call(case, model, data), repeats, steps)
+            continue
+        before = peak_memory_mb()
+        call = plan_call(case, model, data)
+        call()
+        yield row | {"extra_memory_mb": peak_memory_mb() - before} | timed(call, repeats)
+        if not settings.get("compile", True):
+            continue
+        world, actions = model.draw(NUM_PARTICLES, case.horizon, seeded(1)), random_actions(case)
+        rollouts = partial(rollout, world, data.observation[0], actions, NUM_PARTICLES)
+        yield {"what": "rollout step", "how": name} | timed(rollouts, repeats, 1.0 / case.horizon)
+    bare = {"what": "bare arithmetic of a plan", "how": "PyTorch"}
+    yield bare | timed(floor.bare_step(case, num_layers), repeats, steps)
+    predict = peers.gpytorch_calls(case, num_layers)["prediction"]
+    yield {"what": "rollout step", "how": "GPyTorch"} | timed(predict, repeats)
+    for how, settings in (("PETS, float32", {}), ("PETS, bfloat16 inside", {"half_precision": True})):
+        yield {"what": "plan", "how": how} | timed(peers.pets_plan(case, data, **settings), repeats)
+
+
+def training(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
+    """A training iteration (one SG-HMC and one Adam step), an SG-HMC step alone, and GPyTorch's training step."""
+    data, generator = transitions(case, NUM_TRANSITIONS), seeded(0)
+    model = deep_gp(case, num_layers, data)
+    x, y = model._encode(data)
+    standardised = Data(Normaliser.fit(x)(x), Normaliser.fit(y)(y))
+    start = initial_model(standardised, num_layers, model.num_inducing, generator)
+    chain = sghmc.init(x.new_zeros(start.num_whitened()))
+    run = MCEM(model.kernel, start, chain, standardised, model.inference)
+
+    def iterate() -> None:
+        for _ in range(20):  # so that each has its share of an exact draw
+            run.step(generator)
+
+    def sample() -> None:
+        without_gibbs = replace(model.inference, gibbs_every=0)
+        list(mcem.sample(model.kernel, start, chain, standardised, 1, 5, generator, without_gibbs))
+
+    row = {"what": "training iteration"}
+    yield row | {"how": "this package"} | timed(iterate, repeats, 1 / 20)
+    yield row | {"how": "bare arithmetic"} | timed(floor.bare_training(num_layers, BATCH_SIZE), repeats)
+    yield row | {"how": "GPyTorch"} | timed(peers.gpytorch_calls(case, num_layers)["training step"], repeats)
+    yield {"what": "SG-HMC step", "how": "this package"} | timed(sample, repeats, 1 / 5)
+    resample = partial(model.resample, data, generator)
+    yield {"what": "re-sampling within an episode", "how": "this package"} | timed(resample, repeats)
+
+
+def parts(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
+    """Where a plan's time goes, and how near its products come to what the processor does in a large product."""
+    data, cem, generator = transitions(case, NUM_TRANSITIONS), planner(case), seeded(1)
+    actions, scores = random_actions(case), torch.rand(NUM_CANDIDATES, generator=generator)
+    model = deep_gp(case, num_layers, data)
+    world = model.draw(NUM_PARTICLES, case.horizon, generator)
+    states = rollout(world, data.observation[0], actions, NUM_PARTICLES)
+    square = torch.randn(1500, 1500)
+    peak = timed(partial(torch.mm, square, square, out=torch.empty(1500, 1500)), repeats)["p50_ms"]
+    row, times = {"what": "part of a plan"}, case.num_iterations
+
+    yield row | {"how": "whole"} | timed(plan_call(case, model, data), repeats)
+    draw = partial(model.draw, NUM_PARTICLES, case.horizon, generator)
+    yield row | {"how": "drawing the functions"} | timed(draw, repeats)
+    rollouts = timed(partial(rollout, world, data.observation[0], actions, NUM_PARTICLES), repeats, times)
+    flops = floor.rollout_flops(case, num_layers) * case.horizon * times
+    speeds = {"product_gflops": flops / rollouts["p50_ms"] / 1e6, "large_product_gflops": 2.0 * 1500**3 / peak / 1e6}
+    yield row | {"how": "rollouts"} | speeds | rollouts
+    yield (
+        row | {"how": "rewards and returns"} | timed(partial(particle_returns, states, actions, reward), repeats, times)
+    )
+    yield (
+        row | {"how": "CEM itself"} | timed(partial(cem.plan, lambda _: scores, cem.initial_plan(), generator), repeats)
+    )
+
+
+def scaling(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
+    """A plan against K and M; a plan, a re-sampling and a training against N."""
+    data = transitions(case, NUM_TRANSITIONS)
+    for num_candidates in (100, 300, 1000):
+        call = plan_call(case, deep_gp(case, num_layers, data), data, num_candidates)
+        yield {"what": "plan", "varied": "K", "value": num_candidates} | timed(call, repeats)
+    for num_inducing in (100, 200, 400):
+        call = plan_call(case, deep_gp(case, num_layers, data, num_inducing=num_inducing), data)
+        yield {"what": "plan", "varied": "M", "value": num_inducing} | timed(call, repeats)
+    for num_rows in (1_000, 10_000, 100_000):
+        many, varied, before = transitions(case, num_rows), {"varied": "N", "value": num_rows}, peak_memory_mb()
+        model = deep_gp(case, num_layers, many)
+        model.iterations = 30
+        started = time.perf_counter()
+        model.fit(many, seeded(0))
+        whole = {"p50_ms": 1e3 * (time.perf_counter() - started), "repeats": 1}
+        yield {"what": "a later fit, of 30 iterations and 10 samples"} | varied | whole
+        yield {"what": "plan"} | varied | timed(plan_call(case, model, many), repeats)
+        yield (
+            {"what": "re-sampling within an episode"}
+            | varied
+            | timed(partial(model.resample, many, seeded(0)), repeats)
+        )
+        yield {"what": "extra memory, MB"} | varied | {"p50_ms": peak_memory_mb() - before, "repeats": 1}
+
+
+WORKERS = {"plans": plans, "training": training, "parts": parts, "scaling": scaling}

@@ -1,0 +1,99 @@
+"""The tables of `python -m benchmarks.speed`: times, and the ratios that matter, of one run."""
+
+from typing import Any
+
+Row = dict[str, Any]
+
+
+def find(rows: list[Row], **wanted: Any) -> Row | None:
+    """The first row with these values."""
+    return next((row for row in rows if all(row.get(key) == value for key, value in wanted.items())), None)
+
+
+def table(header: list[str], lines: list[list[str]]) -> str:
+    """A Markdown table."""
+    return "\n".join([f"| {' | '.join(line)} |" for line in [header, ["---"] * len(header), *lines]]) + "\n"
+
+
+def ratio(rows: list[Row], slow: Row, fast: Row) -> str:
+    """How many times longer the median of one row is than that of another."""
+    above, below = find(rows, **slow), find(rows, **fast)
+    return f"{above['p50_ms'] / below['p50_ms']:.1f}" if above and below else "–"
+
+
+def ratios(rows: list[Row]) -> str:
+    """The comparisons of the issue of speed, per case, threads and refresh, at the largest number of layers."""
+    lines = []
+    keys = sorted({(r["threads"], r["case"]) for r in rows if r.get("case") and r["worker"] == "plans"})
+    for threads, case in keys:
+        depth = max(r["L"] for r in rows if r.get("case") == case and r["worker"] == "plans" and r["L"])
+        for refresh in ("step", "plan"):
+            at = {"threads": threads, "case": case}
+            ours = at | {"what": "plan", "L": depth, "how": f"pathwise, {refresh}"}
+            step = at | {"what": "rollout step", "L": depth, "how": f"pathwise, {refresh}"}
+            training = at | {"what": "training iteration", "L": depth}
+            lines.append([
+                case, str(depth), refresh, str(threads),
+                ratio(rows, at | {"what": "plan", "L": depth, "how": "joint"}, ours),
+                ratio(rows, at | {"what": "plan", "L": depth, "how": "PETS, float32"}, ours),
+                ratio(rows, at | {"what": "plan", "L": depth, "how": "PETS, bfloat16 inside"}, ours),
+                ratio(rows, at | {"what": "rollout step", "L": depth, "how": "GPyTorch"}, step),
+                ratio(rows, training | {"how": "GPyTorch"}, training | {"how": "this package"}),
+                ratio(rows, ours, at | {"what": "bare arithmetic of a plan", "L": depth}),
+            ])  # fmt: skip
+    header = [
+        "task", "L", "refresh", "threads", "`joint` / plan", "PETS / plan", "PETS in bfloat16 / plan",
+        "GPyTorch / rollout step", "GPyTorch / training iteration", "plan / bare arithmetic in PyTorch",
+    ]  # fmt: skip
+    return table(header, lines)
+
+
+def times(rows: list[Row], worker: str) -> str:
+    """All times of one worker."""
+    extra = [k for k in ("varied", "value", "extra_memory_mb", "product_gflops", "large_product_gflops", "by")
+             if any(k in r for r in rows if r["worker"] == worker)]  # fmt: skip
+    lines = []
+    for row in rows:
+        if row["worker"] != worker:
+            continue
+        cells = [row["case"], str(row["threads"]), row["what"], _cell(row.get("L")), _cell(row.get("how"))]
+        cells += [_cell(row["p50_ms"]), _cell(row.get("p95_ms")), *(_cell(row.get(key)) for key in extra)]
+        lines.append(cells)
+    return table(["task", "threads", "what", "L", "how", "p50 ms", "p95 ms", *extra], lines)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    return (
+        f"{value:.3g}"
+        if isinstance(value, float) and value < 10
+        else f"{value:.0f}"
+        if isinstance(value, float)
+        else str(value)
+    )
+
+
+def document(facts: Row, rows: list[Row]) -> str:
+    """`speed.md`."""
+    repeats = sorted({row["repeats"] for row in rows if row["repeats"] > 1})
+    text = [
+        f"Made by `{facts['command']}`; medians of at least {min(repeats, default=1)} repeats after a warm-up, "
+        "K = 300, P = 5, M = 200, F = 128, Matern-3/2; one process at a time. Versions, processor and load in"
+        " `speed.json`.",
+        "",
+        "How many times longer the others take, by medians (the last column: this package's plan in units of the bare "
+        "products, square roots, exponentials and cosines in PyTorch):",
+        "",
+        ratios(rows),
+    ]
+    titles = {
+        "plans": "Plans and rollout steps",
+        "training": "Training",
+        "parts": "Where a plan's time goes",
+        "scaling": "Scaling",
+    }
+    for worker, title in titles.items():
+        if any(row["worker"] == worker for row in rows):
+            text += [f"## {title}", "", times(rows, worker)]
+    return "\n".join(text)
