@@ -24,6 +24,7 @@ class MujocoTask(MujocoEnv):
         width: of rendered images, in pixels.
         height: of rendered images, in pixels.
         camera: attributes of the viewer's camera.
+        camera_name: a camera of the model, to take pictures with instead of that one.
 
     Raises:
         ValueError: an argument is out of its range; the message names it.
@@ -41,6 +42,7 @@ class MujocoTask(MujocoEnv):
         width: int,
         height: int,
         camera: Mapping[str, Any],
+        camera_name: str | None = None,
     ) -> None:
         frame_skip, width, height = (
             positive_int(name, value)
@@ -57,6 +59,7 @@ class MujocoTask(MujocoEnv):
                 width=width,
                 height=height,
                 default_camera_config=dict(camera),
+                camera_name=camera_name,
             )
         self.metadata = {**type(self).metadata, "render_fps": round(1 / self.dt)}
 
@@ -69,6 +72,7 @@ class MujocoTask(MujocoEnv):
             ValueError: the action has another shape than the action space, or is not finite.
         """
         action, box = np.asarray(action), self.action_space
+        assert isinstance(box, spaces.Box)
         if action.shape != box.shape or not np.all(np.isfinite(action)):
             raise ValueError(f"an action must be an array of shape {box.shape} of finite numbers; got {action!r}")
         if not np.issubdtype(action.dtype, np.floating):
