@@ -222,3 +222,7 @@ def make_risk_sensitive_half_cheetah(penalise_step: bool = False, **kwargs: Any)
         kwargs: of `VelocityHalfCheetahEnv`.
     """
     return RiskSensitiveReward(VelocityHalfCheetahEnv(**kwargs), angle_index=PITCH, penalise_step=penalise_step)
+
+
+# As on a class: tells `gymnasium.make` which other modes it can make of these, such as "rgb_array_list".
+make_risk_sensitive_half_cheetah.metadata = VelocityHalfCheetahEnv.metadata  # type: ignore[attr-defined]

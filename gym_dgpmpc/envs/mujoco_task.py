@@ -83,8 +83,10 @@ class MujocoTask(MujocoEnv):
 
     def render(self) -> Any:
         """Draw the present state in the way ``render_mode`` says."""
-        mujoco.mj_kinematics(self.model, self.data)  # a simulator step leaves the bodies' places one step behind
-        mujoco.mj_comPos(self.model, self.data)  # and a camera that follows a body looks at its centre of mass
+        # A simulator step leaves the bodies' places one step behind, and with them a camera that follows a body.
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
         self._make_context_current()
         return super().render()
 
