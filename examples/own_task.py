@@ -8,7 +8,7 @@ from gym_dgpmpc import DGPMPCAgent
 
 
 class TwoTanks(gym.Env):
-    """A pump (0 to 1) fills a tank that drains into a second one, whose level should be 0.5 m; observed: both levels."""
+    """A pump (0 to 1) fills a tank that drains into another, whose level should be 0.5 m; observed: both levels."""
 
     observation_space = gym.spaces.Box(0.0, 1.0, (2,), np.float64)
     action_space = gym.spaces.Box(0.0, 1.0, (1,), np.float32)
@@ -23,7 +23,8 @@ class TwoTanks(gym.Env):
 
     def step(self, action):
         before, drain = self.levels, 0.1 * np.sqrt(self.levels)
-        self.levels = np.clip(before + [0.12 * action[0] - drain[0], drain[0] - drain[1]], 0.0, 1.0)
+        change = np.array([0.12 * action[0] - drain[0], drain[0] - drain[1]])
+        self.levels = np.clip(before + change, 0.0, 1.0)
         reward = self.reward_fn(*map(torch.as_tensor, (before, action, self.levels)))
         return self.levels.copy(), float(reward), False, False, {}
 

@@ -45,8 +45,7 @@ class MujocoTask(MujocoEnv):
         camera_name: str | None = None,
     ) -> None:
         frame_skip, width, height = (
-            positive_int(name, value)
-            for name, value in (("frame_skip", frame_skip), ("width", width), ("height", height))
+            whole(name, value) for name, value in (("frame_skip", frame_skip), ("width", width), ("height", height))
         )
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}; got {render_mode!r}")
@@ -132,25 +131,19 @@ def not_negative(name: str, value: float) -> float:
     return number
 
 
-def positive_int(name: str, value: int) -> int:
+def whole(name: str, value: int, least: int = 1) -> int:
     """The value as an int.
 
     Raises:
-        ValueError: it is not a whole number of at least 1.
+        ValueError: it is not a whole number of at least ``least``.
     """
-    if (number := _whole(name, value, "a positive integer")) < 1:
-        raise ValueError(f"{name} must be a positive integer; got {value!r}")
-    return number
-
-
-def index_from_zero(name: str, value: int) -> int:
-    """The value as an int.
-
-    Raises:
-        ValueError: it is not a whole number of at least 0.
-    """
-    if (number := _whole(name, value, "an integer from 0 on")) < 0:
-        raise ValueError(f"{name} must be an integer from 0 on; got {value!r}")
+    try:
+        number = index(value)
+    except TypeError:
+        number = least - 1
+    if number < least:
+        what = "a positive integer" if least == 1 else f"an integer from {least} on"
+        raise ValueError(f"{name} must be {what}; got {value!r}")
     return number
 
 
@@ -164,10 +157,3 @@ def point(name: str, value: Sequence[float] | NDArray[Any], what: str, size: int
     if coordinates.shape != (size,):
         raise ValueError(f"{name} must be {what}; got {value!r}")
     return tuple(finite(name, coordinate) for coordinate in coordinates)
-
-
-def _whole(name: str, value: int, what: str) -> int:
-    try:
-        return index(value)
-    except TypeError as error:
-        raise ValueError(f"{name} must be {what}; got {value!r}") from error

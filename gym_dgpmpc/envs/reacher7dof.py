@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gym_dgpmpc.envs.mujoco_task import MujocoTask, index_from_zero, not_negative, point
+from gym_dgpmpc.envs.mujoco_task import MujocoTask, not_negative, point, whole
 from gym_dgpmpc.types import ObservationSpec
 
 MAX_ACTION = 20.0
@@ -195,7 +195,7 @@ class Reacher7DoFEnv(MujocoTask, utils.EzPickle):
         self._target_std = point("target_std", target_std, THREE, 3)
         for std in self._target_std:
             not_negative("target_std", std)
-        self._target_seed = None if target_seed is None else index_from_zero("target_seed", target_seed)
+        self._target_seed = None if target_seed is None else whole("target_seed", target_seed, least=0)
         self._episode, self._has_stepped = 0, False
         self.reward_fn = ReacherReward(not_negative("ctrl_cost_weight", ctrl_cost_weight))
         """The batched reward, a `gym_dgpmpc.types.RewardFn`."""
@@ -239,7 +239,7 @@ class Reacher7DoFEnv(MujocoTask, utils.EzPickle):
         """Begin an episode; ``options={"episode": k}`` begins number k of the sequence of targets."""
         number = (options or {}).get("episode")
         if number is not None:
-            self._episode = index_from_zero('options["episode"]', number)
+            self._episode = whole('options["episode"]', number, least=0)
         elif seed is not None:
             self._episode = 0
         elif self._has_stepped:
@@ -249,10 +249,10 @@ class Reacher7DoFEnv(MujocoTask, utils.EzPickle):
 
     def reset_model(self) -> NDArray[np.float64]:
         """Stretch the arm and draw a target; see the class's description for its distribution."""
-        random = self.np_random
+        generator = self.np_random
         if self._target_seed is not None:
-            random = np.random.default_rng([self._target_seed, self._episode])
-        self.data.mocap_pos[0] = random.normal(self._target_mean, self._target_std)
+            generator = np.random.default_rng([self._target_seed, self._episode])
+        self.data.mocap_pos[0] = generator.normal(self._target_mean, self._target_std)
         self.set_state(np.zeros(7), np.zeros(7))
         return self._get_obs()
 
