@@ -7,16 +7,36 @@ from gym_dgpmpc.envs.registration import register_environments
 
 if TYPE_CHECKING:
     from gym_dgpmpc.agents import DGPMPCAgent, MPCAgent
-    from gym_dgpmpc.envs import ModCartPoleEnv, SwingUpCartPoleEnv
+    from gym_dgpmpc.envs import (
+        BiasedReacherEnv,
+        ModCartPoleEnv,
+        Reacher7DoFEnv,
+        SwingUpCartPoleEnv,
+        VelocityHalfCheetahEnv,
+    )
+    from gym_dgpmpc.wrappers import RiskSensitiveReward
 
-__all__ = ["DGPMPCAgent", "MPCAgent", "ModCartPoleEnv", "SwingUpCartPoleEnv"]
+__all__ = [
+    "BiasedReacherEnv",
+    "DGPMPCAgent",
+    "MPCAgent",
+    "ModCartPoleEnv",
+    "Reacher7DoFEnv",
+    "RiskSensitiveReward",
+    "SwingUpCartPoleEnv",
+    "VelocityHalfCheetahEnv",
+]
 
 # Public name -> the module it is imported from on first use, so that `import gym_dgpmpc` stays light.
 _MODULE_OF = {
+    "BiasedReacherEnv": "gym_dgpmpc.envs",
     "DGPMPCAgent": "gym_dgpmpc.agents",
     "MPCAgent": "gym_dgpmpc.agents",
     "ModCartPoleEnv": "gym_dgpmpc.envs",
+    "Reacher7DoFEnv": "gym_dgpmpc.envs",
+    "RiskSensitiveReward": "gym_dgpmpc.wrappers",
     "SwingUpCartPoleEnv": "gym_dgpmpc.envs",
+    "VelocityHalfCheetahEnv": "gym_dgpmpc.envs",
 }
 
 

@@ -1,8 +1,13 @@
 """The examples run, at a tiny size."""
 
 import math
+from pathlib import Path
 
-from examples import quickstart
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+from examples import own_task, quickstart
 
 TINY = {
     "num_inducing": 10,
@@ -27,3 +32,24 @@ def test_quickstart(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "return over two episodes" in printed
     assert "first action at" in printed
+
+
+def test_own_task():
+    agent = own_task.main(episodes=2, **TINY)
+    assert agent.is_fitted and agent.num_timesteps == 120
+    low, high = agent.store.transitions().next_observation.aminmax(dim=0)
+    assert (low >= 0).all() and (high <= 1).all() and (high > low).all()
+
+
+def test_the_tutorial_shows_the_example():
+    root = Path(own_task.__file__).parents[1]
+    code = Path(own_task.__file__).read_text(encoding="utf-8")
+    assert f"```python\n{code}```\n" in (root / "docs" / "own_task.md").read_text(encoding="utf-8")
+    assert len(code.splitlines()) < 40
+
+
+@pytest.mark.filterwarnings("ignore:.*normalized:UserWarning", "ignore:.*infinity:UserWarning")
+def test_own_task_is_an_environment():
+    env = own_task.TwoTanks()
+    check_env(env, skip_render_check=True)
+    sb3_check_env(env, skip_render_check=True)

@@ -7,14 +7,30 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gym_dgpmpc.envs.half_cheetah import HalfCheetahReward, VelocityHalfCheetahEnv
     from gym_dgpmpc.envs.mod_cartpole import CartPoleReward, ModCartPoleEnv, SwingUpCartPoleEnv
+    from gym_dgpmpc.envs.reacher7dof import BiasedReacherEnv, Reacher7DoFEnv, ReacherReward
 
-__all__ = ["CartPoleReward", "ModCartPoleEnv", "SwingUpCartPoleEnv"]
+__all__ = [
+    "BiasedReacherEnv",
+    "CartPoleReward",
+    "HalfCheetahReward",
+    "ModCartPoleEnv",
+    "Reacher7DoFEnv",
+    "ReacherReward",
+    "SwingUpCartPoleEnv",
+    "VelocityHalfCheetahEnv",
+]
 
 _MODULE_OF = {
+    "BiasedReacherEnv": "gym_dgpmpc.envs.reacher7dof",
     "CartPoleReward": "gym_dgpmpc.envs.mod_cartpole",
+    "HalfCheetahReward": "gym_dgpmpc.envs.half_cheetah",
     "ModCartPoleEnv": "gym_dgpmpc.envs.mod_cartpole",
+    "Reacher7DoFEnv": "gym_dgpmpc.envs.reacher7dof",
+    "ReacherReward": "gym_dgpmpc.envs.reacher7dof",
     "SwingUpCartPoleEnv": "gym_dgpmpc.envs.mod_cartpole",
+    "VelocityHalfCheetahEnv": "gym_dgpmpc.envs.half_cheetah",
 }
 
 

@@ -3,19 +3,16 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import as_file, files
-from operator import index
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 import torch
-from gymnasium import spaces, utils
-from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium import utils
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gym_dgpmpc.envs.mujoco_task import MujocoTask, finite, not_negative, point
 from gym_dgpmpc.types import ObservationSpec
 
 POLE_LENGTH = 0.6
@@ -27,7 +24,7 @@ RAIL_LIMIT = 2.5
 MAX_ACTION = 3.0
 """Largest magnitude of an action; one unit is 100 N."""
 
-DEFAULT_CAMERA_CONFIG: dict[str, Any] = {"lookat": np.zeros(3), "distance": 6.3, "azimuth": 90.0, "elevation": -6.0}
+CAMERA: dict[str, Any] = {"lookat": np.zeros(3), "distance": 6.3, "azimuth": 90.0, "elevation": -6.0}
 
 
 class CartPoleRewardTerms(NamedTuple):
@@ -76,7 +73,7 @@ class CartPoleReward:
         return closeness - control_cost
 
 
-class ModCartPoleEnv(MujocoEnv, utils.EzPickle):
+class ModCartPoleEnv(MujocoTask, utils.EzPickle):
     """Swing a pole up beside the end of its rail.
 
     ## Description
@@ -145,8 +142,6 @@ class ModCartPoleEnv(MujocoEnv, utils.EzPickle):
     * v0: first version.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}  # noqa: RUF012
-
     def __init__(
         self,
         start_position: float = 2.4,
@@ -171,38 +166,25 @@ class ModCartPoleEnv(MujocoEnv, utils.EzPickle):
             width,
             height,
         )
-        self._start_position = _finite("start_position", start_position)
+        self._start_position = finite("start_position", start_position)
         if abs(self._start_position) > RAIL_LIMIT:
             raise ValueError(f"start_position must lie on the rail, in [-2.5, 2.5]; got {start_position!r}")
-        self._reset_noise_scale = _finite("reset_noise_scale", reset_noise_scale)
-        if self._reset_noise_scale < 0:
-            raise ValueError(f"reset_noise_scale must not be negative; got {reset_noise_scale!r}")
-        if _finite("reward_scale", reward_scale) <= 0:
+        self._reset_noise_scale = not_negative("reset_noise_scale", reset_noise_scale)
+        if finite("reward_scale", reward_scale) <= 0:
             raise ValueError(f"reward_scale must be positive; got {reward_scale!r}")
-        if _finite("ctrl_cost_weight", ctrl_cost_weight) < 0:
-            raise ValueError(f"ctrl_cost_weight must not be negative; got {ctrl_cost_weight!r}")
-        frame_skip, width, height = (
-            _positive_int(name, value)
-            for name, value in (("frame_skip", frame_skip), ("width", width), ("height", height))
-        )
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}; got {render_mode!r}")
-
-        self.reward_fn = CartPoleReward(_point("target", target), float(reward_scale), float(ctrl_cost_weight))
+        x, z = point("target", target, "two finite numbers, x and z in m", 2)
+        self.reward_fn = CartPoleReward((x, z), float(reward_scale), not_negative("ctrl_cost_weight", ctrl_cost_weight))
         """The batched reward, a `gym_dgpmpc.types.RewardFn`."""
 
-        with as_file(files("gym_dgpmpc.envs") / "assets" / "cartpole.xml") as path:
-            MujocoEnv.__init__(
-                self,
-                str(path),
-                frame_skip,
-                observation_space=spaces.Box(-np.inf, np.inf, (4,), np.float64),
-                render_mode=render_mode,
-                width=width,
-                height=height,
-                default_camera_config=DEFAULT_CAMERA_CONFIG,
-            )
-        self.metadata = {**type(self).metadata, "render_fps": round(1 / self.dt)}
+        super().__init__(
+            "cartpole.xml",
+            4,
+            frame_skip=frame_skip,
+            render_mode=render_mode,
+            width=width,
+            height=height,
+            camera=CAMERA,
+        )
         target_x, target_z = self.reward_fn.target
         self.model.site("target").pos[:] = target_x, 0.0, target_z
 
@@ -215,13 +197,7 @@ class ModCartPoleEnv(MujocoEnv, utils.EzPickle):
         self, action: NDArray[Any]
     ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, float]]:
         """Apply the action, shape (1,) in units of 100 N, for ``frame_skip`` simulator steps."""
-        action = np.asarray(action)
-        if action.shape != (1,) or not math.isfinite(action[0]):
-            raise ValueError(f"an action must be one finite number, an array of shape (1,); got {action!r}")
-        if not np.issubdtype(action.dtype, np.floating):
-            action = action.astype(np.float32)
-        action = action.clip(-MAX_ACTION, MAX_ACTION)
-        self.do_simulation(action, self.frame_skip)
+        action = self.perform(action)
         observation = self._get_obs()
 
         terms = self.reward_fn.terms(torch.from_numpy(action), torch.from_numpy(observation))
@@ -240,27 +216,6 @@ class ModCartPoleEnv(MujocoEnv, utils.EzPickle):
         position = np.clip(self._start_position + noise[0], -RAIL_LIMIT, RAIL_LIMIT)
         self.set_state(np.array([position, noise[1]]), noise[2:])
         return self._get_obs()
-
-    def render(self) -> Any:
-        """Draw the present state in the way ``render_mode`` says."""
-        mujoco.mj_kinematics(self.model, self.data)  # a simulator step leaves the bodies' places one step behind
-        self._make_context_current()
-        return super().render()
-
-    def close(self) -> None:
-        """Release what rendering holds; harmless when done before, or when nothing was rendered."""
-        viewer = self._make_context_current()
-        if viewer is not None:  # freed later, with another environment's context current, it would free that one's
-            viewer.con.free()
-        super().close()
-        self.mujoco_renderer.viewer = None
-
-    def _make_context_current(self) -> Any:
-        """Give OpenGL back to this environment's viewer, if there is one: another may have drawn in between."""
-        viewer: Any = self.mujoco_renderer.viewer
-        if viewer is not None:
-            viewer.make_context_current()
-        return viewer
 
     def _get_obs(self) -> NDArray[np.float64]:
         return np.concatenate([self.data.qpos, self.data.qvel])
@@ -299,31 +254,3 @@ class SwingUpCartPoleEnv(ModCartPoleEnv):
     ) -> None:
         super().__init__(start_position, target, **kwargs)
         utils.EzPickle.__init__(self, start_position, target, **kwargs)
-
-
-def _finite(name: str, value: float) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a finite number; got {value!r}") from error
-    if not math.isfinite(number):
-        raise ValueError(f"{name} must be a finite number; got {value!r}")
-    return number
-
-
-def _positive_int(name: str, value: int) -> int:
-    try:
-        number = index(value)
-    except TypeError as error:
-        raise ValueError(f"{name} must be a positive integer; got {value!r}") from error
-    if number < 1:
-        raise ValueError(f"{name} must be a positive integer; got {value!r}")
-    return number
-
-
-def _point(name: str, value: Sequence[float] | NDArray[Any]) -> tuple[float, float]:
-    coordinates = np.asarray(value, dtype=object)
-    if coordinates.shape != (2,):
-        raise ValueError(f"{name} must be two finite numbers, x and z in m; got {value!r}")
-    x, z = (_finite(name, coordinate) for coordinate in coordinates)
-    return x, z

@@ -5,6 +5,10 @@ import gymnasium
 ENVIRONMENTS: dict[str, tuple[str, int]] = {
     "ModCartPole-v0": ("gym_dgpmpc.envs.mod_cartpole:ModCartPoleEnv", 200),
     "SwingUpCartPole-v0": ("gym_dgpmpc.envs.mod_cartpole:SwingUpCartPoleEnv", 200),
+    "Reacher7DoF-v0": ("gym_dgpmpc.envs.reacher7dof:Reacher7DoFEnv", 150),
+    "BiasedReacher-v0": ("gym_dgpmpc.envs.reacher7dof:BiasedReacherEnv", 150),
+    "VelocityHalfCheetah-v0": ("gym_dgpmpc.envs.half_cheetah:VelocityHalfCheetahEnv", 1000),
+    "RiskSensitiveHalfCheetah-v0": ("gym_dgpmpc.envs.half_cheetah:make_risk_sensitive_half_cheetah", 1000),
 }
 """Environment id -> (entry point, steps after which an episode is truncated)."""
 

@@ -40,6 +40,8 @@ class EpisodeRecorder(gymnasium.Wrapper):
         on_end: called with each episode that ends.
     """
 
+    keeps_task = True  # for `known.find`: what is known of the environment holds for the recorded one too
+
     def __init__(self, env: gymnasium.Env, on_end: Callable[[Episode], None] | None = None):
         super().__init__(env)
         self.last: Episode | None = None

@@ -1,0 +1,174 @@
+"""What is known of Gymnasium's own continuous-control tasks: reward, termination, how to read the observation.
+
+`find` looks an environment up. The functions are those of the environments' own `step`, as functions of (observation,
+action, next observation), with the weights and ranges that the environment was made with. docs/environments.md has a
+table of what is known of which task, and of what must be learned.
+"""
+
+from collections.abc import Callable
+from copy import deepcopy
+from inspect import signature
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+from gymnasium import wrappers
+from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.monitor import Monitor
+
+from gym_dgpmpc.envs import known_rewards as known
+from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
+
+HARMLESS_WRAPPERS = (
+    Monitor,
+    wrappers.Autoreset,
+    wrappers.HumanRendering,
+    wrappers.OrderEnforcing,
+    wrappers.PassiveEnvChecker,
+    wrappers.RecordEpisodeStatistics,
+    wrappers.RecordVideo,
+    wrappers.RenderCollection,
+    wrappers.TimeLimit,
+)
+"""Wrappers that intervene in `step` and leave observation, action, reward and termination as they are."""
+
+
+class KnownTask(NamedTuple):
+    """What is known of an environment."""
+
+    reward_fn: RewardFn | None
+    """None: the reward is not a function of observation, action and next observation, and must be learned."""
+    terminated_fn: TerminatedFn | None
+    """None: an episode never terminates. Where it does, the termination of every task here is known."""
+    observation_spec: ObservationSpec
+
+
+def find(env: gym.Env | EnvSpec) -> KnownTask | None:
+    """What is known of an environment, or None if it is not one of Gymnasium's own.
+
+    Nothing is known of an environment whose class is only derived from one of these, whose MuJoCo model was replaced
+    (``xml_file``), or that stands under a wrapper that may change what its numbers mean: any that has a `step` of its
+    own, but for `HARMLESS_WRAPPERS` and those that say so by an attribute ``keeps_task = True``.
+
+    Args:
+        env: the environment with its wrappers, or the spec to make it from.
+    """
+    if isinstance(env, EnvSpec):
+        spec = deepcopy(env)
+        spec.kwargs.pop("render_mode", None)
+        made = gym.make(spec)
+        try:
+            return find(made)
+        finally:
+            made.close()
+    while isinstance(env, gym.Wrapper):
+        keeps_task = isinstance(env, HARMLESS_WRAPPERS) or getattr(type(env), "keeps_task", False)
+        if not keeps_task and type(env).step is not gym.Wrapper.step:
+            return None
+        env = env.env
+    task = _TASKS.get(f"{type(env).__module__}:{type(env).__qualname__}")
+    return None if task is None or not _has_its_own_model(env) else task(env)
+
+
+def _has_its_own_model(env: Any) -> bool:
+    """Whether a MuJoCo environment simulates the model that its class comes with; true of all others."""
+    parameter = signature(type(env)).parameters.get("xml_file")
+    if parameter is None:
+        return True
+    from gymnasium.envs.mujoco.mujoco_env import expand_model_path  # imports MuJoCo, which is not always needed
+
+    return bool(env.fullpath == expand_model_path(parameter.default))
+
+
+def _pendulum(env: Any) -> KnownTask:
+    """Observation (cos, sin, rate): the angle is encoded already."""
+    return KnownTask(known.PendulumReward(float(env.max_torque)), None, ObservationSpec())
+
+
+def _mountain_car(env: Any) -> KnownTask:
+    goal = known.GoalReached(float(env.goal_position), float(env.goal_velocity))
+    return KnownTask(known.MountainCarReward(goal), goal, ObservationSpec())
+
+
+def _inverted_pendulum(env: Any) -> KnownTask:
+    fallen = known.AngleBeyond(index=1, limit=0.2)
+    return KnownTask(known.SurvivalReward(fallen), fallen, ObservationSpec())
+
+
+def _inverted_double_pendulum(env: Any) -> KnownTask:
+    """The last number, the force of the rail's end, follows from the others, but only where the cart touches it."""
+    fallen = known.TipBelow(1.0)
+    reward = known.DoublePendulumReward(float(env._healthy_reward), fallen)
+    return KnownTask(reward, fallen, ObservationSpec(absolute=(8,), not_inputs=(8,)))
+
+
+def _reacher(env: Any) -> KnownTask:
+    """The arm does not feel the target (4, 5), nor does its way to it (8, 9) tell more than its angles do."""
+    reward = known.PlanarReacherReward(float(env._reward_dist_weight), float(env._reward_control_weight))
+    return KnownTask(reward, None, ObservationSpec(not_inputs=(4, 5, 8, 9), constant=(4, 5)))
+
+
+def _pusher(env: Any) -> KnownTask:
+    """The object's height (19) and the goal (20 to 22) stay as they are, and nothing touches the goal."""
+    reward = known.PusherReward(
+        float(env._reward_near_weight), float(env._reward_dist_weight), float(env._reward_control_weight)
+    )
+    fixed = (19, 20, 21, 22)
+    return KnownTask(reward, None, ObservationSpec(not_inputs=fixed, constant=fixed))
+
+
+def _cheetah(env: Any) -> KnownTask:
+    return _runner(env, num_positions=1, pitch=1)
+
+
+def _swimmer(env: Any) -> KnownTask:
+    return _runner(env, num_positions=2, pitch=0)
+
+
+def _hopper(env: Any) -> KnownTask:
+    return _runner(env, num_positions=1, pitch=1, can_fall=True)
+
+
+def _walker(env: Any) -> KnownTask:
+    return _runner(env, num_positions=1, pitch=1, can_fall=True)
+
+
+def _runner(env: Any, num_positions: int, pitch: int, can_fall: bool = False) -> KnownTask:
+    """The tasks that reward the way forwards in a step.
+
+    The reward is known if the observation begins with the ``num_positions`` places along the floor
+    (``exclude_current_positions_from_observation=False``), which then are predicted without being inputs, because it
+    does not matter where on the floor one is. The trunk's angle, ``pitch`` places after them, turns freely.
+    """
+    has_position = not env._exclude_current_positions_from_observation
+    first = num_positions if has_position else 0
+    unhealthy = None
+    if can_fall:
+        state_range = getattr(env, "_healthy_state_range", None)  # the hopper's
+        unhealthy = known.Unhealthy(first, env._healthy_z_range, env._healthy_angle_range, state_range)
+    reward = None
+    if has_position:
+        reward = known.ForwardReward(
+            dt=float(env.dt),
+            forward_weight=float(env._forward_reward_weight),
+            ctrl_cost_weight=float(env._ctrl_cost_weight),
+            healthy_reward=0.0 if unhealthy is None else float(env._healthy_reward),
+            unhealthy=unhealthy,
+        )
+    ends = can_fall and env._terminate_when_unhealthy
+    spec = ObservationSpec(angles=(first + pitch,), not_inputs=tuple(range(first)))
+    return KnownTask(reward, unhealthy if ends else None, spec)
+
+
+_TASKS: dict[str, Callable[[Any], KnownTask]] = {
+    "gymnasium.envs.classic_control.pendulum:PendulumEnv": _pendulum,
+    "gymnasium.envs.classic_control.continuous_mountain_car:Continuous_MountainCarEnv": _mountain_car,
+    "gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv": _inverted_pendulum,
+    "gymnasium.envs.mujoco.inverted_double_pendulum_v5:InvertedDoublePendulumEnv": _inverted_double_pendulum,
+    "gymnasium.envs.mujoco.reacher_v5:ReacherEnv": _reacher,
+    "gymnasium.envs.mujoco.pusher_v5:PusherEnv": _pusher,
+    "gymnasium.envs.mujoco.half_cheetah_v5:HalfCheetahEnv": _cheetah,
+    "gymnasium.envs.mujoco.swimmer_v5:SwimmerEnv": _swimmer,
+    "gymnasium.envs.mujoco.hopper_v5:HopperEnv": _hopper,
+    "gymnasium.envs.mujoco.walker2d_v5:Walker2dEnv": _walker,
+}
+"""The class of the environment, as module:name so that none is imported here -> what is known of an instance."""
