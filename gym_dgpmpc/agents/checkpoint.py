@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import zipfile
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -124,7 +125,7 @@ def _read(file: IO[bytes] | io.BufferedIOBase, where: str) -> Checkpoint:
 
 
 def _part(name: str, where: str) -> str:
-    if not name.endswith(".safetensors"):
+    if not re.fullmatch(r"[a-z_]+\.safetensors", name):
         raise CheckpointError(f"{where} holds an unknown member {name!r}")
     return name.removesuffix(".safetensors")
 

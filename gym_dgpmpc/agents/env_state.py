@@ -188,25 +188,24 @@ def set_generator_states(env: gymnasium.Env, states: GeneratorStates) -> None:
 def _generators(
     env: gymnasium.Env, *, create: bool = True, spaces: Collection[str] = ()
 ) -> Iterator[tuple[str, np.random.Generator]]:
-    """Every generator with its place, such as "2._np_random" (of the second wrapper from outside).
+    """Every generator with its place, such as "1.action_space" (of the innermost wrapper; 0 is the environment).
 
     Args:
         create: make the environment's own generator, which is made on first use, if there is none yet.
         spaces: places of spaces whose generators to make likewise.
     """
-    layer: Any = env
-    for depth in range(64):
-        if create and not isinstance(layer, gymnasium.Wrapper) and hasattr(layer, "np_random"):
-            _ = layer.np_random
+    layers: list[Any] = [env]
+    while isinstance(layers[-1], gymnasium.Wrapper):
+        layers.append(layers[-1].env)
+    if create and hasattr(layers[-1], "np_random"):
+        _ = layers[-1].np_random
+    for depth, layer in enumerate(reversed(layers)):
         for name, value in sorted(vars(layer).items()):
             place = f"{depth}.{name}"
             if isinstance(value, np.random.Generator):
                 yield place, value
             elif isinstance(value, gymnasium.Space) and (place in spaces or vars(value).get("_np_random")):
                 yield place, value.np_random
-        if not isinstance(layer, gymnasium.Wrapper):
-            return
-        layer = layer.env
 
 
 def _plain(value: Any) -> Any:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 MAX_FILE_BYTES = (1 << 31) - 1
 """Larger zips need the format's 64-bit extension, whose tables could claim anything; an agent has some megabytes."""
-MAX_JSON_BYTES = 4 << 20
+MAX_JSON_BYTES = 2 << 20
 MAX_HEADER_BYTES = 1 << 20
 MAX_MEMBERS = 64
 MAX_NESTING = 32

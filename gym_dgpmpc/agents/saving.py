@@ -36,7 +36,7 @@ AGENT_CLASSES = {"MPCAgent": "gym_dgpmpc.agents.mpc", "DGPMPCAgent": "gym_dgpmpc
 PACKAGES = ("gym_dgpmpc", "gymnasium", "numpy", "stable_baselines3", "torch")
 MAX_NUMBER = 10**7
 """No numeric argument in a file may exceed this, so that none makes a constructor take up the memory."""
-MAX_SIZES = {"num_candidates": 10**5, "num_particles": 10**4, "num_features": 10**5}
+MAX_SIZES = {"num_layers": 100, "num_candidates": 10**5, "num_particles": 10**4, "num_features": 10**5}
 MAX_STATES = 10**8
 """Nor the arguments that say how large a plan is, of which H K P states are held at once."""
 MAX_EPISODE_INFOS = 10_000
@@ -165,6 +165,10 @@ def saved_arguments(checkpoint: Checkpoint, agent_class: Any) -> dict[str, Any]:
     for name, value in arguments.items():
         if name != "seed" and isinstance(value, int | float) and not abs(value) <= MAX_SIZES.get(name, MAX_NUMBER):
             raise CheckpointError(f"the file's argument {name} = {value} is larger than any agent's")
+    if not isinstance(arguments.get("tensorboard_log"), str | None):
+        raise CheckpointError(
+            f"the file's argument tensorboard_log = {arguments['tensorboard_log']} is no folder's name"
+        )
     decoded = {name: _decode(value) for name, value in arguments.items()}
     _check_plan_size(checkpoint, decoded)
     defaults = inspect.signature(agent_class).parameters
