@@ -4,6 +4,7 @@ Each run is a process forked from this one, so that nothing has to be imported a
 what the run is doing; the killer waits until it does what is wanted, and then a random moment more.
 """
 
+import itertools
 import mmap
 import os
 import random
@@ -182,7 +183,7 @@ def run_kills(folder, num_kills, seed=0):
     Returns:
         Rows for the table: task, kills by phase, runs compared, what was lost.
     """
-    rng, watch, rows = random.Random(seed), Watch(), []
+    rng, watch, rows, phases = random.Random(seed), Watch(), [], itertools.cycle(PHASES)
     folder = Path(folder)
     for index, task in enumerate(TASKS):
         wanted = num_kills // len(TASKS) + (index < num_kills % len(TASKS))
@@ -196,10 +197,10 @@ def run_kills(folder, num_kills, seed=0):
             runs += 1
             killed = folder / f"killed{index}_{runs}"
             watch.clear()
-            for attempt in range(rng.randint(2, 6) + 1):
+            for _ in range(rng.randint(2, 6)):
                 child = start(task, killed, watch)
-                phase = PHASES[(sum(kills.values()) + attempt) % len(PHASES)]
-                if sum(kills.values()) == wanted or (hit := kill_when(child, watch, phase, rng)) is None:
+                enough = sum(kills.values()) == wanted
+                if enough or (hit := kill_when(child, watch, next(phases), rng)) is None:
                     break
                 kills[hit] += 1
                 lost += check_nothing_lost(killed, watch)
