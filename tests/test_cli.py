@@ -60,6 +60,8 @@ def test_train_and_evaluate(run, tmp_path, drawable):
     assert "return of 2 planned episodes: mean" in result.stdout
     assert "next: dgpmpc evaluate a" in result.stdout
     assert {path.name for path in (tmp_path / "a").iterdir()} == {
+        ".lock",
+        "agent.previous.zip",
         "agent.zip",
         "episodes.csv",
         "last_episode.gif",
@@ -148,7 +150,7 @@ def test_interruption(run, monkeypatch):
 )
 def test_train_says_what_is_wrong(run, tmp_path, arguments, texts):
     assert is_one_line_error(run("train", *arguments, "--no-video"), *texts)
-    assert not list(tmp_path.rglob("*.*"))
+    assert [path for path in tmp_path.rglob("*.*") if path.name != ".lock"] == []
 
 
 def test_an_error_without_words_says_where_it_was(run, monkeypatch):
@@ -200,7 +202,7 @@ def test_runs_as_a_module():
 def test_options_show_the_agents_defaults_and_the_presets():
     arguments = inspect.signature(DGPMPCAgent).parameters
     options_of_the_agent = {name: shown for name, shown in shown_defaults().items() if name in arguments}
-    assert len(options_of_the_agent) == 19
+    assert len(options_of_the_agent) == 20
     del options_of_the_agent["seed"]  # the command line has a default of its own
     assert inspect.signature(cli.train).parameters.keys() >= options_of_the_agent.keys()
     for name, shown in options_of_the_agent.items():

@@ -11,11 +11,15 @@ from gym_dgpmpc.errors import PlanningError
 from gym_dgpmpc.reporting.run import RunFolder, RunFolderError, TrainingRun
 from tests.reporting.toy import EPISODE_STEPS, SMALLEST_AGENT
 
+HOLDERS = []
 SETTINGS = {"environment": "ToyPush-v0", "seed": 0}
 
 
 def training_run(path, num_episodes=2, env_id="ToyPush-v0", **env_arguments):
+    for holder in HOLDERS:  # what an earlier process would have let go of by its end
+        holder.close()
     folder = RunFolder(path, SETTINGS)
+    HOLDERS[:] = [folder]
     env = gymnasium.make(env_id, **env_arguments)
     steps = EPISODE_STEPS * (1 + num_episodes)
     run = TrainingRun(folder, env, SMALLEST_AGENT | {"seed": 0}, num_episodes=num_episodes, total_timesteps=steps)
@@ -94,7 +98,7 @@ def test_goes_on_after_an_interruption_within_an_episode(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run.train(progress_bar=False)
     # As if the interruption had come between the row of an episode and the saving of its agent.
-    run.folder.append_row(run.folder.rows()[-1]._replace(episode=3, total_steps=36))
+    run.folder.write_rows([*run.folder.rows(), run.folder.rows()[-1]._replace(episode=3, total_steps=36)])
 
     run = training_run(tmp_path)
     assert run.agent.num_timesteps == 24
@@ -121,6 +125,7 @@ def test_what_was_finished_survives_a_failure(tmp_path, monkeypatch):
 
 def test_refuses_another_runs_folder(tmp_path):
     training_run(tmp_path, num_episodes=1).train(progress_bar=False)
+    HOLDERS[0].close()
     with pytest.raises(RunFolderError, match=r"other settings .seed was 0, now 1.*--overwrite"):
         RunFolder(tmp_path, SETTINGS | {"seed": 1})
     (tmp_path / "settings.json").write_text("[]")
@@ -133,6 +138,7 @@ def test_overwrites_only_when_asked(tmp_path):
     run.train(progress_bar=False)
     run.write_figures("")
     (tmp_path / "notes.txt").write_text("mine")
+    HOLDERS[0].close()
     folder = RunFolder(tmp_path, {"seed": 1}, overwrite=True)
     assert not folder.goes_on
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", ".lock-holder.json", "notes.txt"]
