@@ -68,7 +68,7 @@ class TerminatedFn(Protocol):
 
 @runtime_checkable
 class TransitionSampler(Protocol):
-    """One draw of the world, valid for one plan: P particles, each a map (state, action) -> next state.
+    """One draw of the world, valid for the plans of one moment: P particles, each a map (state, action) -> next state.
 
     ``step`` is the index of the step within the plan, 0 <= step < the horizon the sampler was drawn for; samplers
     whose functions do not change along a plan ignore it.
@@ -110,6 +110,9 @@ class DynamicsModel(Protocol):
 
     def load_state_dict(self, state: StateDict) -> None: ...
 
+
+DynamicsFactory = Callable[[int, int, ObservationSpec], DynamicsModel]
+"""(observation size, action size, how to read the observation) -> an untrained model of such transitions."""
 
 Objective = Callable[[Float[Tensor, "K H A"]], Float[Tensor, "K"]]
 """Scores K candidate action sequences; higher is better; a score that is not finite never wins."""

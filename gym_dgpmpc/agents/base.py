@@ -1,145 +1,33 @@
-"""A planning agent as a Stable-Baselines3 algorithm: everything but how it learns.
+"""A planning agent as a Stable-Baselines3 algorithm: everything but how it is made and how it learns.
 
-Construction and its checks, `predict`, seeds, environments, logs, `save` and `load`. How it learns is in `mpc.py`.
+`predict`, logs, `save` and `load`. How it is made is in `composition.py`, how it learns in `mpc.py`.
 """
 
 import time
-import warnings
 from collections.abc import Iterable
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_system_info, safe_mean
 
 from gym_dgpmpc.agents.checkpoint import CheckpointPath, write_checkpoint
+from gym_dgpmpc.agents.composition import ComposedAgent
+from gym_dgpmpc.agents.dict_observations import flatten
 from gym_dgpmpc.agents.plan_state import PlanState, PolicyState, pack, unpack
-from gym_dgpmpc.agents.policy import PlanningPolicy
-from gym_dgpmpc.agents.randomness import fresh_seed, observation_generator, split_seed
+from gym_dgpmpc.agents.randomness import observation_generator
 from gym_dgpmpc.agents.saving import collect, load_agent
-from gym_dgpmpc.agents.task import Task, find_task, flat_size, wrapped_env
-from gym_dgpmpc.data.transitions import TransitionStore
+from gym_dgpmpc.agents.task import (
+    flat_size,
+)
 from gym_dgpmpc.errors import EnvironmentDataError
-from gym_dgpmpc.types import DynamicsModel, Planner, RewardFn, TerminatedFn
 
 SelfAgent = TypeVar("SelfAgent", bound="PlanningAgent")
 
 
-class PlanningAgent(BaseAlgorithm):
+class PlanningAgent(ComposedAgent):
     """What every agent that plans through a learned model offers to SB3's helpers; see `MPCAgent` for the arguments."""
-
-    observation_space: spaces.Box
-    action_space: spaces.Box
-    dynamics: DynamicsModel
-    planner: Planner
-    seed: int
-    _last_obs: np.ndarray | None
-
-    saved_arguments: ClassVar[tuple[str, ...]] = (
-        "num_particles",
-        "actions_per_plan",
-        "learning_starts",
-        "time_budget",
-        "stats_window_size",
-        "tensorboard_log",
-        "verbose",
-        "seed",
-    )
-    """Constructor arguments that a saved file holds; each is also an attribute of that name."""
-
-    def __init__(
-        self,
-        env: GymEnv | str | None,
-        dynamics: DynamicsModel | None = None,
-        planner: Planner | None = None,
-        *,
-        reward_fn: RewardFn | None = None,
-        terminated_fn: TerminatedFn | None = None,
-        num_particles: int = 5,
-        actions_per_plan: int = 1,
-        learning_starts: int | None = None,
-        time_budget: float | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: torch.device | str = "cpu",
-        _init_setup_model: bool = True,
-    ):
-        if learning_starts is not None and learning_starts < 1:
-            raise ValueError(f"learning_starts must be at least 1, got {learning_starts}")
-        if env is not None:
-            env = wrapped_env(env)
-        super().__init__(
-            policy=BasePolicy,
-            env=env,
-            learning_rate=0.0,  # the base class wants one; the dynamics model has its own
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            device=device,
-            seed=seed,
-            supported_action_spaces=(spaces.Box,),
-        )
-        self.verbose, self.stats_window_size = verbose, stats_window_size
-        if dynamics is not None:
-            self.dynamics = dynamics
-        if planner is not None:
-            self.planner = planner
-        self.num_particles, self.actions_per_plan = num_particles, actions_per_plan
-        self.learning_starts, self.time_budget = learning_starts, time_budget
-        self.given_reward_fn, self.given_terminated_fn = reward_fn, terminated_fn
-        self.seeds_environment = seed is not None
-        self.seed = fresh_seed() if seed is None else seed
-        if _init_setup_model:
-            if self.seeds_environment:
-                super().set_random_seed(self.seed)
-            self._setup_model()
-
-    def _setup_model(self) -> None:
-        """Create what an untrained agent has, once the spaces are known."""
-        if not hasattr(self, "dynamics") or not hasattr(self, "planner"):
-            raise ValueError("an MPCAgent is made of a dynamics model and a planner: pass dynamics=... and planner=...")
-        self.store = TransitionStore(flat_size(self.observation_space), flat_size(self.action_space))
-        self.generators = split_seed(self.seed, self.device)
-        self._task: Task | None = None
-        if self.env is not None or self.given_reward_fn is not None:
-            self._task = self._find_task()
-        self.planning = PlanningPolicy(
-            self.dynamics,
-            self.planner,
-            self.action_space,
-            self.num_particles,
-            self.actions_per_plan,
-            self.device,
-            self.time_budget,
-        )
-        self.num_fitted = 0  # transitions that the last training saw
-        self._warned: set[str] = set()
-
-    @property
-    def is_fitted(self) -> bool:
-        """Whether the dynamics model has been trained."""
-        return self.num_fitted > 0
-
-    @property
-    def num_late_plans(self) -> int:
-        """Plans that took longer than ``time_budget``, of `learn` and `predict` together, since the agent was made."""
-        return self.planning.num_late
-
-    @property
-    def task(self) -> Task:
-        """The reward and termination that are planned with.
-
-        Raises:
-            UnknownRewardError: the agent has neither a reward function nor an environment that offers one.
-        """
-        if self._task is None:
-            self._task = self._find_task()
-        return self._task
 
     def predict(
         self,
@@ -155,7 +43,7 @@ class PlanningAgent(BaseAlgorithm):
         and the first one warns.
 
         Args:
-            observation: [S], or [n, S] of n environments.
+            observation: [S], or [n, S] of n environments; or a dict of such, if the environment's are.
             state: what the last call returned; None plans from scratch.
             episode_start: [n], true where a new episode begins and the state is to be forgotten.
             deterministic: draw worlds and candidates from a generator that depends on the agent's seed and on the
@@ -198,32 +86,13 @@ class PlanningAgent(BaseAlgorithm):
         self, observation: np.ndarray, before: PlanState, generator: torch.Generator
     ) -> tuple[np.ndarray, PlanState]:
         late = self.planning.num_late
-        action, after, _ = self.planning.plan(self.task, observation, before, generator)
+        task, start = self.modelled.task(self.task), self.modelled.start(observation)
+        action, after, _ = self.planning.plan(task, start, before, generator)
         if self.planning.num_late > late:
             self._warn_once(
                 f"a plan took longer than its time_budget of {self.time_budget} s; num_late_plans counts them"
             )
         return action, after
-
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """Go on in another environment of the same spaces; its reward is planned with, unless one was given.
-
-        Raises:
-            ValueError: its spaces are others, or it cannot be planned for.
-            UnknownRewardError: there is no reward function.
-        """
-        env = wrapped_env(env)
-        task = find_task(env, self.given_reward_fn, self.given_terminated_fn)
-        self.n_envs = env.num_envs  # an agent loaded without an environment has none
-        super().set_env(env, force_reset)
-        self._task = task
-
-    def set_random_seed(self, seed: int | None = None) -> None:
-        """Start all random streams afresh, the environment's included; None changes nothing."""
-        super().set_random_seed(seed)
-        if seed is not None:
-            self.seed, self.seeds_environment = seed, True
-            self.generators = split_seed(seed, self.device)
 
     def dump_logs(self) -> None:
         """Write what was recorded since the last time, with running means and speed."""
@@ -302,21 +171,12 @@ class PlanningAgent(BaseAlgorithm):
         """
         raise NotImplementedError(f"to take over what another agent has learned use {type(self).__name__}.load(path)")
 
-    def _find_task(self) -> Task:
-        both_spaces = self.observation_space, self.action_space
-        return find_task(self.env, self.given_reward_fn, self.given_terminated_fn, both_spaces)
-
     def _checked_observations(self, observation: Any) -> tuple[np.ndarray, bool]:
         """Observations as float32 [n, S], and whether they came with that first dimension."""
-        array = np.asarray(observation, dtype=np.float32)
+        array = np.asarray(flatten(observation), dtype=np.float32)
         size = flat_size(self.observation_space)
         if array.ndim not in (1, 2) or array.shape[-1] != size:
             raise ValueError(f"expected an observation of shape ({size},) or (n, {size}), got {np.shape(observation)}")
         if not np.all(np.isfinite(array)):
             raise EnvironmentDataError(f"cannot plan from an observation that is not finite: {observation}")
         return array.reshape(-1, size), array.ndim == 2
-
-    def _warn_once(self, message: str) -> None:
-        if message not in self._warned:
-            self._warned.add(message)
-            warnings.warn(message, stacklevel=3)

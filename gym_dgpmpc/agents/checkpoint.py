@@ -25,8 +25,9 @@ from gym_dgpmpc.agents.reading import UnsafeFileError, open_members, parse_json,
 from gym_dgpmpc.errors import CheckpointError, CheckpointWriteError
 
 FORMAT = "gym_dgpmpc agent"
-SCHEMA = 2
-"""1: without what a running episode needs to go on, and without the arguments added since (see `saving.py`)."""
+SCHEMA = 3
+"""1: without what a running episode needs to go on. 2: of one environment, whose reward was not learned. Either is
+without the arguments added since (see `saving.py`)."""
 
 CheckpointPath = str | os.PathLike[str] | IO[bytes] | io.BufferedIOBase
 

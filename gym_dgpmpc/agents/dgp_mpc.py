@@ -9,7 +9,7 @@ import torch
 from stable_baselines3.common.type_aliases import GymEnv
 
 from gym_dgpmpc.agents.mpc import MPCAgent
-from gym_dgpmpc.agents.task import find_observation_spec, flat_size
+from gym_dgpmpc.agents.task import Learned
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
 from gym_dgpmpc.dynamics.deep_gp_draws import Draw, Refresh
 from gym_dgpmpc.inference.mcem import InferenceSettings
@@ -89,7 +89,6 @@ class DGPMPCAgent(MPCAgent):
         "num_candidates",
         "num_elites",
         "num_iterations",
-        "observation_spec",
     )
 
     def __init__(
@@ -117,10 +116,11 @@ class DGPMPCAgent(MPCAgent):
         num_iterations: int = 5,
         actions_per_plan: int = 1,
         learning_starts: int | None = None,
+        train_freq: int | None = None,
         compile: bool = True,
         time_budget: float | None = None,
-        reward_fn: RewardFn | None = None,
-        terminated_fn: TerminatedFn | None = None,
+        reward_fn: RewardFn | Learned | None = None,
+        terminated_fn: TerminatedFn | Learned | None = None,
         observation_spec: ObservationSpec | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -136,14 +136,16 @@ class DGPMPCAgent(MPCAgent):
         self.step_size, self.batch_size, self.gibbs_every = step_size, batch_size, gibbs_every
         self.horizon, self.num_candidates = horizon, num_candidates
         self.num_elites, self.num_iterations = num_elites, num_iterations
-        self.compile, self.observation_spec = compile, observation_spec
+        self.compile = compile
         super().__init__(
             env,
             reward_fn=reward_fn,
             terminated_fn=terminated_fn,
+            observation_spec=observation_spec,
             num_particles=num_particles,
             actions_per_plan=actions_per_plan,
             learning_starts=learning_starts,
+            train_freq=train_freq,
             time_budget=time_budget,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
@@ -154,8 +156,7 @@ class DGPMPCAgent(MPCAgent):
         )
 
     def _setup_model(self) -> None:
-        """Build the parts for the environment's spaces."""
-        self.observation_spec = find_observation_spec(self.env, self.observation_spec)
+        """Build the planner for the environment's spaces; the model follows when it is known what it has to predict."""
         low, high = (
             torch.as_tensor(bound, dtype=torch.float32, device=self.device).flatten()
             for bound in (self.action_space.low, self.action_space.high)
@@ -168,10 +169,15 @@ class DGPMPCAgent(MPCAgent):
             num_elites=max(1, self.num_candidates // 10) if self.num_elites is None else self.num_elites,
             num_iterations=self.num_iterations,
         )
-        self.dynamics = DeepGPDynamics(
-            flat_size(self.observation_space),
-            flat_size(self.action_space),
-            self.observation_spec,
+        super()._setup_model()
+
+    def _make_dynamics(
+        self, observation_size: int, action_size: int, observation_spec: ObservationSpec
+    ) -> DeepGPDynamics:
+        return DeepGPDynamics(
+            observation_size,
+            action_size,
+            observation_spec,
             num_layers=self.num_layers,
             kernel=self.kernel,
             num_inducing=self.num_inducing,
@@ -189,4 +195,3 @@ class DGPMPCAgent(MPCAgent):
             compile=self.compile,
             device=self.device,
         )
-        super()._setup_model()

@@ -37,10 +37,13 @@ class EpisodeStart(gymnasium.Wrapper):
     What the environment raises becomes the cause of an `EnvironmentFailedError`.
     """
 
+    keeps_task = True  # for `known.find`
+
     def __init__(self, env: gymnasium.Env):
         super().__init__(env)
         self.seed: int | None = None
         self.generators: GeneratorStates | None = None
+        self.options: dict[str, Any] | None = None
         self.num_steps = 0
         self.last_step: StepResult | None = None
 
@@ -49,7 +52,9 @@ class EpisodeStart(gymnasium.Wrapper):
         self.seed, self.num_steps = seed, 0
         self.generators = dict(_states(self.env, create=seed is None))
         with _failures_named("reset"):
-            return self.env.reset(seed=seed, options=options)
+            result = self.env.reset(seed=seed, options=options)
+        self.options = _own_options(self.env, again=True)
+        return result
 
     def step(self, action: Any) -> StepResult:
         self.last_step = None
@@ -77,9 +82,9 @@ def remember_starts(vec_env: VecEnv) -> None:
 
 
 def episode_start(vec_env: VecEnv | None) -> EpisodeStart | None:
-    """The wrapper of `remember_starts`; None in an environment that runs in another process."""
+    """The wrapper of `remember_starts`; None in an environment that runs in another process, or beside others."""
     inner = None if vec_env is None else vec_env.unwrapped
-    found = inner.envs[0] if isinstance(inner, DummyVecEnv) else None
+    found = inner.envs[0] if isinstance(inner, DummyVecEnv) and inner.num_envs == 1 else None
     return found if isinstance(found, EpisodeStart) else None
 
 
@@ -106,6 +111,8 @@ def describe_start(vec_env: VecEnv | None) -> dict[str, Any] | None:
         "seed": start.seed,
         "before_reset": start.generators,
         "now": generator_states(start.env),
+        "options": start.options,
+        "options_now": _own_options(start.env, again=False),
         "num_steps": start.num_steps,
         "can_replay": can_replay(start),
     }
@@ -124,6 +131,7 @@ def return_to_start(vec_env: VecEnv, description: dict[str, Any]) -> ndarray:
     vec_env.unwrapped._reset_seeds()  # a seed that waits for the next reset would undo it
     if description["seed"] is not None:
         vec_env.seed(int(description["seed"]))
+    set_options(vec_env, [description.get("options")])
     observation = vec_env.reset()
     assert isinstance(observation, ndarray)
     return observation
@@ -135,6 +143,37 @@ def set_present_generators(vec_env: VecEnv, description: dict[str, Any]) -> None
     if start is not None:
         set_generator_states(start.env, description["now"])
         vec_env.unwrapped._reset_seeds()
+        set_options(vec_env, [description.get("options_now")])
+
+
+def options_to_reset(vec_env: VecEnv | None, *, again: bool) -> list[dict[str, Any] | None] | None:
+    """Of each environment the options of `reset` that begin its running episode again, or else the one after it.
+
+    An environment whose episodes follow on one another, such as by a number that decides where the target is, has them
+    as its method ``options_to_reset(again)``: a dict of plain values. The others need none.
+    """
+    if vec_env is None or not vec_env.has_attr("options_to_reset"):
+        return None
+    return vec_env.env_method("options_to_reset", again)
+
+
+def set_options(vec_env: VecEnv, options: Any) -> None:
+    """Let the next resets have the options of `options_to_reset`, of as many environments, if there are any.
+
+    Raises:
+        CheckpointError: they are none.
+    """
+    if not options or not any(options) or not vec_env.has_attr("options_to_reset"):
+        return
+    if not isinstance(options, list) or not all(each is None or isinstance(each, dict) for each in options):
+        raise CheckpointError(f"the options for the environment's reset cannot be read: {options!r}")
+    if len(options) == vec_env.num_envs:
+        vec_env.set_options([each or {} for each in options])
+
+
+def _own_options(env: gymnasium.Env, *, again: bool) -> dict[str, Any] | None:
+    offered = env.has_wrapper_attr("options_to_reset")
+    return env.get_wrapper_attr("options_to_reset")(again) if offered else None
 
 
 def replay(

@@ -6,24 +6,25 @@ Processes"; it stands in one function, `MPCAgent._control`.
 
 import os
 import time
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 
-from gym_dgpmpc.agents.base import PlanningAgent
-from gym_dgpmpc.agents.env_state import episode_start
+from gym_dgpmpc.agents.acting import ActingAgent
 from gym_dgpmpc.agents.episode import EpisodeRecord
+from gym_dgpmpc.agents.reward_guard import disagreements
 from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
+from gym_dgpmpc.agents.running import next_episode
 from gym_dgpmpc.agents.safeguard import Safeguard, continue_logs
-from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
+from gym_dgpmpc.errors import EnvironmentDataError
 
 SelfAgent = TypeVar("SelfAgent", bound="MPCAgent")
 
 
-class MPCAgent(PlanningAgent):
+class MPCAgent(ActingAgent):
     """Learns a dynamics model from its own experience and acts by planning through it.
 
     The first steps are uniformly random. From then on the model is trained at each episode's start, and every action
@@ -60,19 +61,9 @@ class MPCAgent(PlanningAgent):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self._carried = self.planning.cold  # the running episode's plan
-        self._record = EpisodeRecord(1, self.planning.horizon)
-        self._episode_index = 0  # of the running episode in the store
-        self._explored_episode = False  # whether an episode of random actions has ended
         self._pending_logs: list[tuple[str, float, int, Any]] = []  # of a checkpoint, for the logger of `learn`
         self._safeguard: Safeguard | None = None
-
-    @property
-    def is_exploring(self) -> bool:
-        """Whether the next action is random because there are too few transitions to learn from."""
-        if self.is_fitted:
-            return False
-        return not self._explored_episode if self.learning_starts is None else len(self.store) < self.learning_starts
+        self._has_described = False  # whether it was said where reward and termination come from
 
     def learn(
         self: SelfAgent,
@@ -151,153 +142,87 @@ class MPCAgent(PlanningAgent):
         return self
 
     def _control(self, total_timesteps: int, callback: BaseCallback, log_interval: int) -> None:
-        """Algorithm 2 of the paper, one pass through the loop per control step."""
+        """Algorithm 2 of the paper, one pass through the loop per control step (of all environments)."""
         while self.num_timesteps < total_timesteps:
             # For each episode: train the model, that is, optimise {Z, theta, beta} and sample U.
-            if self._starts_episode:
-                self._begin_episode(callback)
+            for index in np.flatnonzero(self._starts):
+                self._begin_episode(int(index), callback)
             self._fit_if_due()
 
             # Sample K action sequences and P trajectories of each, update m and v by their returns, repeat.
-            observation = self._observation
+            observations = self._observations
             if self.is_exploring:
-                action = self.planning.uniform(self.generators.exploration)
+                actions = np.stack([self.planning.uniform(self.generators.exploration) for _ in self._running])
             else:
-                action = self._plan(observation)
+                actions = self._plan(observations)
 
             # Perform the first action of the sequence, append the observed tuple to the data set.
-            rewards, dones, infos = self._perform_and_append(observation, action)
+            rewards, dones, infos = self._perform_and_append(observations, actions)
 
             # Re-sample the inducing outputs U.
             if self.is_fitted:
-                self.dynamics.resample(self.store.transitions(), self.generators.fit)
+                self.dynamics.resample(self.modelled.transitions(self.store), self.generators.fit)
 
-            if dones[0]:
-                self._end_episode(infos, dones, callback, log_interval)
+            if np.any(dones):
+                self._update_info_buffer(infos, dones)
+            for index in np.flatnonzero(dones):
+                self._end_episode(int(index), callback, log_interval)
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
             callback.update_locals(locals())
             goes_on = callback.on_step()
             if self._safeguard is not None:
-                self._safeguard.after_step(episode_ended=bool(dones[0]))
+                self._safeguard.after_step(episode_ended=bool(np.any(dones)))
             if not goes_on:
                 return
         self._fit_if_due()
 
-    def _begin_episode(self, callback: BaseCallback) -> None:
+    def _begin_episode(self, index: int, callback: BaseCallback) -> None:
         """A new episode starts with a cold plan."""
-        received = self._observation
+        received = self._observations[index]
         if not np.all(np.isfinite(received)):
             self._last_obs = None
             raise EnvironmentDataError(
                 f"after {self.num_timesteps} steps: the environment's reset returned an observation that is not "
                 f"finite: {received}"
             )
-        self._carried = self.planning.cold
-        self._record = EpisodeRecord(self._episode_num + 1, self.planning.horizon)
-        self._episode_index = int(self.store.episodes[-1]) + 1 if len(self.store) else 0
+        running = self._running[index]
+        running.carried = self.planning.cold
+        running.record = EpisodeRecord(self._episode_num + 1, self.planning.horizon)
+        running.index = next_episode(self.store, [other for other in self._running if other is not running])
         callback.on_rollout_start()
 
     def _fit_if_due(self) -> None:
-        """Train if an episode ended, or exploration did, and there is something new to learn from."""
-        due = not self.is_exploring and (self._starts_episode or not self.is_fitted)
-        if not due or len(self.store) == self.num_fitted:
+        """Train if an episode ended (or enough was seen since the last time), or exploration did."""
+        num_new = len(self.store) - self.num_fitted
+        due = bool(self._starts.any()) if self.train_freq is None else num_new >= self.train_freq
+        if self.is_exploring or not num_new or not (due or not self.is_fitted):
             return
+        if not self.is_fitted:
+            for disagreement in disagreements(self.task, self.store, self.device):
+                self._warn_once(disagreement)
+        if self.learns_termination and not self.modelled.terminated and self.store.terminated.any():
+            self.model(reward=self.modelled.reward, terminated=True)
         started = time.perf_counter()
         with nullcontext() if self._safeguard is None else self._safeguard.stop.at_any_time():
-            metrics = dict(self.dynamics.fit(self.store.transitions(), self.generators.fit))
+            metrics = dict(self.dynamics.fit(self.modelled.transitions(self.store), self.generators.fit))
         self.num_fitted = len(self.store)
         metrics |= {"num_transitions": self.num_fitted, "seconds": time.perf_counter() - started}
         for name, value in metrics.items():
             self.logger.record(f"train/{name}", value)
 
-    def _plan(self, observation: np.ndarray) -> np.ndarray:
-        """The next action [A] of the running episode's plan, which is made anew when it is used up."""
-        started, late = time.perf_counter(), self.planning.num_late
-        action, self._carried, info = self.planning.plan(
-            self.task, observation, self._carried, self.generators.planning
-        )
-        if info is not None:
-            seconds = time.perf_counter() - started
-            self._record.add_plan(info, seconds, late=self.planning.num_late > late)
-        return action
-
-    def _perform_and_append(
-        self, observation: np.ndarray, action: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Step the environment and store what it did; a step counts only once it is stored."""
-        # Until then there is no observation to go on from: after an error, learn begins a new episode.
-        self._last_obs = None
-        assert self.env is not None
-        start = episode_start(self.env)
-        if start is not None:
-            start.last_step = None
-        try:
-            new_obs, rewards, dones, infos = self.env.step(action.reshape(1, *self.action_space.shape))
-        except Exception as error:
-            step = self.num_timesteps
-            self._keep_last_step(observation, action)
-            named = isinstance(error, EnvironmentFailedError)
-            what = str(error) if named else f"the environment raised {type(error).__name__}: {error}"
-            raise EnvironmentFailedError(f"step {step}: {what}") from (error.__cause__ if named else error)
-        assert isinstance(new_obs, np.ndarray)
-        # At an episode's end the environment has been reset already, and the true next observation is set aside.
-        next_observation = infos[0]["terminal_observation"] if dones[0] else new_obs[0]
-        terminated = bool(dones[0]) and not infos[0].get("TimeLimit.truncated", False)
-        if self._vec_normalize_env is not None:
-            rewards = self._vec_normalize_env.get_original_reward()
-        self._append(observation, action, next_observation, float(rewards[0]), terminated)
-        self._last_obs, self._last_episode_starts = new_obs, dones
-        if terminated and self.task.terminated_fn is None:
-            self._warn_once(
-                "the environment ended an episode by termination, which the planner knows nothing of: pass "
-                "terminated_fn=..., or give the environment an attribute of that name"
-            )
-        return rewards, dones, list(infos)
-
-    def _append(
-        self, observation: np.ndarray, action: np.ndarray, after: np.ndarray, reward: float, terminated: bool
-    ) -> None:
-        self.store.append(observation, action, after, reward=reward, terminated=terminated, episode=self._episode_index)
-        self.num_timesteps += 1
-        self._record.add_reward(reward)
-
-    def _keep_last_step(self, observation: np.ndarray, action: np.ndarray) -> None:
-        """Store the step that ended an episode, where it is the reset after it that failed."""
-        start = episode_start(self.env)
-        if start is None or start.last_step is None or not any(start.last_step[2:4]):
-            return
-        after, reward, terminated, _, _ = start.last_step
-        with suppress(EnvironmentDataError):
-            self._append(observation, action, after, float(np.float32(reward)), bool(terminated))
-            self._explored_episode = True
-            self._episode_num += 1
-
-    def _end_episode(
-        self, infos: list[dict[str, Any]], dones: np.ndarray, callback: BaseCallback, log_interval: int
-    ) -> None:
+    def _end_episode(self, index: int, callback: BaseCallback, log_interval: int) -> None:
         """Count, log and print what happened."""
-        self._explored_episode = True
+        running = self._running[index]
+        running.has_explored = True
         self._episode_num += 1
-        self._update_info_buffer(infos, dones)
+        running.record.number = self._episode_num
         if self.verbose >= 1:
-            print(self._record.line(self.num_timesteps), flush=True)
-        for name, value in self._record.metrics().items():
+            print(running.record.line(self.num_timesteps), flush=True)
+        for name, value in running.record.metrics().items():
             self.logger.record(name, value)
         if log_interval is not None and self._episode_num % log_interval == 0:
             self.dump_logs()
         callback.on_rollout_end()
-
-    @property
-    def _observation(self) -> np.ndarray:
-        """The present observation, [S]."""
-        assert self._last_obs is not None
-        return self._last_obs[0]
-
-    @property
-    def _starts_episode(self) -> bool:
-        """Whether the present observation is the first of an episode."""
-        assert self._last_episode_starts is not None
-        return bool(self._last_episode_starts[0])
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         # SB3 prints its tables at verbose=1; here that level is one line per episode.
@@ -310,4 +235,7 @@ class MPCAgent(PlanningAgent):
             self.logger.record(name, value, tuple(excluded or ()))
             self.logger.name_to_count[name] = count
         self._pending_logs = []
+        if self.verbose >= 1 and not self._has_described:
+            print(self.task.describe(can_learn_termination=self.learns_termination), flush=True)
+            self._has_described = True
         return found

@@ -5,6 +5,8 @@ Knows nothing of learning or of the environment; the agent asks it both while it
 
 import math
 import time
+from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import torch
@@ -14,7 +16,7 @@ from gym_dgpmpc.agents.plan_state import PlanState
 from gym_dgpmpc.agents.task import Task
 from gym_dgpmpc.errors import PlanningError
 from gym_dgpmpc.planning.rollout import rollout_objective
-from gym_dgpmpc.types import DynamicsModel, PlanInfo, Planner
+from gym_dgpmpc.types import DynamicsModel, PlanInfo, Planner, TransitionSampler
 
 
 class PlanningPolicy:
@@ -64,9 +66,18 @@ class PlanningPolicy:
             for bound in (action_space.low, action_space.high)
         )
 
+    def worlds(self, generator: torch.Generator) -> Callable[[], TransitionSampler]:
+        """One draw of the worlds, made when it is first asked for; plans made together may share it."""
+        return cache(lambda: self.dynamics.draw(self.num_particles, self.horizon, generator))
+
     @torch.no_grad()
     def plan(
-        self, task: Task, observation: np.ndarray, state: PlanState, generator: torch.Generator
+        self,
+        task: Task,
+        observation: np.ndarray,
+        state: PlanState,
+        generator: torch.Generator,
+        worlds: Callable[[], TransitionSampler] | None = None,
     ) -> tuple[np.ndarray, PlanState, PlanInfo | None]:
         """One action from the carried plan; if none of its actions are left, optimise it first.
 
@@ -74,10 +85,11 @@ class PlanningPolicy:
         worlds is part of the budget; a plan that was late all the same is counted.
 
         Args:
-            task: the reward and termination to plan with.
-            observation: [S].
+            task: the reward and termination to plan with, as functions of what the model predicts.
+            observation: [V], as the model sees it.
             state: what the last step of the same episode returned, or `cold`.
             generator: for the worlds and the planner.
+            worlds: of `worlds`; None draws some for this plan alone.
 
         Returns:
             The action [A], the state to carry to the next step, and what the planner found (None if no plan was made).
@@ -90,9 +102,10 @@ class PlanningPolicy:
             deadline = math.inf if self.time_budget is None else time.perf_counter() + self.time_budget
             # A planner need not know of deadlines as long as none is asked for.
             limit = {} if self.time_budget is None else {"deadline": deadline}
-            worlds = self.dynamics.draw(self.num_particles, self.horizon, generator)
+            drawn = self.worlds(generator)() if worlds is None else worlds()
             start = torch.as_tensor(observation, dtype=torch.float32, device=self.device)
-            objective = rollout_objective(worlds, task.reward_fn, start, self.num_particles, task.terminated_fn)
+            assert task.reward_fn is not None
+            objective = rollout_objective(drawn, task.reward_fn, start, self.num_particles, task.terminated_fn)
             try:
                 plan, info = self.planner.plan(objective, plan, generator, **limit)
             except PlanningError as error:

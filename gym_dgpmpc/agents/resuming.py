@@ -7,9 +7,10 @@ import numpy as np
 from numpy import ndarray
 
 from gym_dgpmpc.agents.checkpoint import Checkpoint
-from gym_dgpmpc.agents.env_state import replay, return_to_start, set_present_generators
+from gym_dgpmpc.agents.env_state import replay, return_to_start, set_options, set_present_generators
 from gym_dgpmpc.agents.randomness import derive_seed
-from gym_dgpmpc.agents.saving import encode, restore, saved_arguments, saved_spaces
+from gym_dgpmpc.agents.saved import saved_arguments, saved_running, saved_spaces
+from gym_dgpmpc.agents.saving import encode, restore, to_learn
 from gym_dgpmpc.errors import CheckpointError, ReliabilityWarning
 
 MAY_DIFFER = {"verbose", "tensorboard_log", "stats_window_size", "time_budget"}
@@ -31,12 +32,14 @@ def resume_agent(agent: Any, checkpoint: Checkpoint) -> None:
     """
     _refuse_another(agent, checkpoint)
     restore(agent, checkpoint)
+    _ = agent.task  # an error if the reward that was given is missing
     agent.seed = checkpoint.config["arguments"]["seed"]
     agent._last_obs = None
     episode = checkpoint.config.get("episode")
     if episode is None:
         if agent.seeds_environment:
             agent.env.seed(derive_seed(agent.seed, "environment", agent.num_timesteps))
+        set_options(agent.env, checkpoint.config.get("reset_options"))
         return
     try:
         if episode["goes_on"] and (episode["num_steps"] == 0 or episode["can_replay"]):
@@ -51,7 +54,7 @@ def resume_agent(agent: Any, checkpoint: Checkpoint) -> None:
 
 def _continue_episode(agent: Any, checkpoint: Checkpoint, episode: dict[str, Any]) -> None:
     """Begin the episode again and repeat its actions; on a difference, warn and let a new one begin."""
-    rows = np.flatnonzero(agent.store.episodes.numpy() == agent._episode_index)
+    rows = np.flatnonzero(agent.store.episodes.numpy() == agent._running[0].index)
     rows = rows[len(rows) - episode["num_steps"] :] if episode["num_steps"] else rows[:0]
     last = checkpoint.tensors["agent"]["last_observation"].numpy()
     data = agent.store.transitions()
@@ -87,9 +90,13 @@ def _refuse_another(agent: Any, checkpoint: Checkpoint) -> None:
     given_seed = {"seed"} if agent.seeds_environment else set()
     differing = [
         f"{name} was {saved[name]}, now {getattr(agent, name)}"
-        for name in sorted(saved.keys() - MAY_DIFFER - ({"seed"} - given_seed))
+        for name in sorted(set(checkpoint.config["arguments"]) - MAY_DIFFER - ({"seed"} - given_seed))
         if encode(saved[name]) != encode(getattr(agent, name))
     ]
+    if checkpoint.config.get("to_learn", to_learn(agent)) != to_learn(agent):
+        differing.append(f"what was to be learned was {checkpoint.config['to_learn']}, now {to_learn(agent)}")
+    if len(saved_running(checkpoint)) != agent.n_envs:
+        differing.append(f"it had {len(saved_running(checkpoint))} environments, now {agent.n_envs}")
     both = agent.observation_space, agent.action_space
     if saved_spaces(checkpoint) != both:
         differing.append(f"its spaces were {saved_spaces(checkpoint)}, now {both}")

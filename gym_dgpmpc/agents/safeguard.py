@@ -89,7 +89,8 @@ class Safeguard:
             CheckpointWriteError: the checkpoint cannot be written.
         """
         stopping = self.stop.received is not None
-        every = self.every is not None and self.agent.num_timesteps % self.every == 0
+        # A step of n environments is n timesteps, so it may pass over the multiple.
+        every = self.every is not None and self.agent.num_timesteps % self.every < self.agent.n_envs
         if episode_ended or ((stopping or every) and self._can_go_on_within_an_episode()):
             self._save()
         if stopping:
@@ -97,7 +98,7 @@ class Safeguard:
 
     def _can_go_on_within_an_episode(self) -> bool:
         start = episode_start(self.agent.env)
-        if start is not None and can_replay(start):
+        if (start is not None and can_replay(start)) or self.agent.n_envs > 1:  # then episodes begin anew all the same
             return True
         if self.every is not None:
             self.agent._warn_once(

@@ -9,39 +9,30 @@ environment itself, and of a plain `MPCAgent` the objects it was composed of.
 """
 
 import importlib.metadata
-import inspect
 import math
 from collections import deque
 from dataclasses import asdict
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import Tensor
 
-from gym_dgpmpc.agents.checkpoint import SCHEMA, Checkpoint, CheckpointPath, read_checkpoint
-from gym_dgpmpc.agents.env_state import describe_start
+from gym_dgpmpc.agents.checkpoint import Checkpoint, CheckpointPath, read_checkpoint
+from gym_dgpmpc.agents.dict_observations import layout
+from gym_dgpmpc.agents.env_state import describe_start, options_to_reset, set_options
 from gym_dgpmpc.agents.plan_state import pack, unpack
 from gym_dgpmpc.agents.randomness import derive_seed
-from gym_dgpmpc.agents.task import offered_by, wrapped_env
-from gym_dgpmpc.errors import CheckpointError, DGPMPCError
+from gym_dgpmpc.agents.saved import asked_to_learn, class_of, saved_arguments, saved_running, saved_spaces
+from gym_dgpmpc.agents.task import LEARNED, environment_id, wrapped_env
+from gym_dgpmpc.errors import CheckpointError, DGPMPCError, UnknownRewardError
 from gym_dgpmpc.types import ObservationSpec, StateDict
 
-AGENT_CLASSES = {"MPCAgent": "gym_dgpmpc.agents.mpc", "DGPMPCAgent": "gym_dgpmpc.agents.dgp_mpc"}
-"""The classes that a file may name, and where they are; nothing else is ever imported for a file."""
-
 PACKAGES = ("gym_dgpmpc", "gymnasium", "numpy", "stable_baselines3", "torch")
-MAX_NUMBER = 10**7
-"""No numeric argument in a file may exceed this, so that none makes a constructor take up the memory."""
-MAX_SIZES = {"num_layers": 100, "num_candidates": 10**5, "num_particles": 10**4, "num_features": 10**5}
-MAX_STATES = 10**8
-"""Nor the arguments that say how large a plan is, of which H K P states are held at once."""
 MAX_EPISODE_INFOS = 10_000
 
-COUNTERS = ("num_timesteps", "num_fitted", "_episode_num", "_episode_index", "_explored_episode")
+COUNTERS = ("num_timesteps", "num_fitted", "_episode_num")
 
 
 def collect(agent: Any, *, gives_up: bool = False) -> Checkpoint:
@@ -54,12 +45,19 @@ def collect(agent: Any, *, gives_up: bool = False) -> Checkpoint:
     boxes = {"observation_space": agent.observation_space, "action_space": agent.action_space}
     bounds = {f"{name}.low": torch.tensor(box.low) for name, box in boxes.items()}
     bounds |= {f"{name}.high": torch.tensor(box.high) for name, box in boxes.items()}
-    plan = dict(zip(("plan.mean", "plan.std", "plan.age"), map(torch.from_numpy, pack([agent._carried])), strict=True))
+    running = agent._running
+    carried = pack([episode.carried for episode in running])
+    plan = dict(zip(("plan.mean", "plan.std", "plan.age"), map(torch.from_numpy, carried), strict=True))
+    records = {
+        f"record.{index}.{name}": value
+        for index, episode in enumerate(running)
+        for name, value in episode.record.state_dict().items()
+    }
     tensors = {
         "dynamics": agent.dynamics.state_dict(),
         "transitions": agent.store.state_dict(),
         "generators": agent.generators.state_dict(),
-        "agent": bounds | plan | {f"record.{name}": value for name, value in agent._record.state_dict().items()},
+        "agent": bounds | plan | records,
     }
     goes_on = agent._last_obs is not None and not gives_up
     if goes_on:
@@ -67,15 +65,19 @@ def collect(agent: Any, *, gives_up: bool = False) -> Checkpoint:
             "last_observation": torch.tensor(agent._last_obs),
             "last_episode_starts": torch.tensor(agent._last_episode_starts),
         }
-    spec = offered_by(agent.env, "spec")
     start = describe_start(agent.env)
     config = {
         "class": type(agent).__name__,
         "arguments": {name: encode(getattr(agent, name)) for name in agent.saved_arguments},
+        "to_learn": to_learn(agent),
+        "modelled": {"reward": agent.modelled.reward, "terminated": agent.modelled.terminated},
+        "observation_parts": {key: [part.start, part.stop] for key, part in layout(agent.env).items()},
         "seeds_environment": agent.seeds_environment,
-        "environment": None if spec is None else spec.id,
+        "environment": environment_id(agent.env),
         "space_dtypes": {name: str(box.dtype) for name, box in boxes.items()},
         "counters": {name: getattr(agent, name) for name in COUNTERS},
+        "running": [{"index": episode.index, "has_explored": episode.has_explored} for episode in running],
+        "reset_options": options_to_reset(agent.env, again=True),
         "episode": None if start is None else {**start, "goes_on": goes_on},
         "pending_logs": _pending_logs(agent),
         "episode_infos": [_plain(info) for info in agent.ep_info_buffer or ()][-MAX_EPISODE_INFOS:],
@@ -108,8 +110,8 @@ def load_agent(
         CheckpointError: the file cannot be read, holds something else, or does not fit ``env``.
     """
     checkpoint = read_checkpoint(path)
-    agent_class = _class_of(checkpoint, asked)
-    arguments = saved_arguments(checkpoint, agent_class) | replaced
+    agent_class = class_of(checkpoint, asked)
+    arguments = saved_arguments(checkpoint, agent_class) | asked_to_learn(checkpoint) | replaced
     both_spaces = saved_spaces(checkpoint)
     if env is not None:
         env = wrapped_env(env)
@@ -118,91 +120,34 @@ def load_agent(
                 f"the agent was saved for observations {both_spaces[0]} and actions {both_spaces[1]}, "
                 f"the environment has {env.observation_space} and {env.action_space}"
             )
+        parts, present = checkpoint.config.get("observation_parts") or {}, layout(env)
+        if parts and present and parts != {key: [part.start, part.stop] for key, part in present.items()}:
+            raise CheckpointError(
+                f"the agent was saved for Dict observations of {parts}, the environment has {present}"
+            )
     try:
         agent = agent_class(env, device=device, _init_setup_model=False, **arguments)
         agent.observation_space, agent.action_space = both_spaces
-        agent.n_envs = 1
+        agent.n_envs = len(saved_running(checkpoint)) if env is None else env.num_envs
         agent._setup_model()
     except DGPMPCError:
         raise
     except Exception as error:
         raise CheckpointError(f"no {agent_class.__name__} can be made with {arguments}: {error}") from error
     restore(agent, checkpoint, keep_generators="seed" not in replaced, force_reset=force_reset)
+    if agent.env is not None:
+        _ = agent.task  # an error if the reward that was given is missing
     if agent.env is not None and agent.seeds_environment and force_reset:
         # Not the seed itself: an environment that is seeded with it again repeats the episodes of the first run.
         agent.env.seed(derive_seed(agent.seed, "environment", agent.num_timesteps))
+    if agent.env is not None and force_reset:
+        set_options(agent.env, checkpoint.config.get("reset_options"))
     return agent
 
 
-def _class_of(checkpoint: Checkpoint, asked: type) -> Any:
-    """The class that a file names: one of the package's, or the very class that was asked to load it."""
-    name = checkpoint.config.get("class")
-    if name == asked.__name__:
-        return asked
-    if not isinstance(name, str) or name not in AGENT_CLASSES:
-        raise CheckpointError(f"the file holds an agent of the class {name!r}, not of {', '.join(AGENT_CLASSES)}")
-    found = getattr(import_module(AGENT_CLASSES[name]), name)
-    if not issubclass(found, asked):
-        raise CheckpointError(f"the file holds a {name}: load it with {name}.load, not {asked.__name__}.load")
-    return found
-
-
-def saved_arguments(checkpoint: Checkpoint, agent_class: Any) -> dict[str, Any]:
-    """The constructor arguments in a file, decoded; those that an older schema did not have are the constructor's.
-
-    Raises:
-        CheckpointError: they are not this class's, or larger than any agent's.
-    """
-    arguments, expected = checkpoint.config.get("arguments"), set(agent_class.saved_arguments)
-    received = set(arguments) if isinstance(arguments, dict) else set()
-    complete = received == expected or (checkpoint.schema < SCHEMA and received < expected)
-    if not isinstance(arguments, dict) or not complete:
-        raise CheckpointError(
-            f"the file's arguments are not those of {agent_class.__name__}: expected {sorted(expected)}, got "
-            f"{sorted(received) if isinstance(arguments, dict) else arguments}. If another version of the package "
-            "wrote it, load it with that one"
-        )
-    for name, value in arguments.items():
-        if name != "seed" and isinstance(value, int | float) and not abs(value) <= MAX_SIZES.get(name, MAX_NUMBER):
-            raise CheckpointError(f"the file's argument {name} = {value} is larger than any agent's")
-    if not isinstance(arguments.get("tensorboard_log"), str | None):
-        raise CheckpointError(
-            f"the file's argument tensorboard_log = {arguments['tensorboard_log']} is no folder's name"
-        )
-    decoded = {name: _decode(value) for name, value in arguments.items()}
-    _check_plan_size(checkpoint, decoded)
-    defaults = inspect.signature(agent_class).parameters
-    return {name: defaults[name].default for name in expected - received} | decoded
-
-
-def _check_plan_size(checkpoint: Checkpoint, arguments: dict[str, Any]) -> None:
-    """The horizon must be that of the plan in the file, whose bytes are there; and a plan's states be countable."""
-    mean = checkpoint.tensors.get("agent", {}).get("plan.mean")
-    horizon = mean.shape[1] if mean is not None and mean.ndim == 3 else 1
-    if arguments.get("horizon", horizon) != horizon:
-        raise CheckpointError(
-            f"the file's argument horizon = {arguments['horizon']} is not that of its plan, {horizon}"
-        )
-    sizes = [horizon, *(arguments.get(name, 1) for name in ("num_candidates", "num_particles"))]
-    if all(isinstance(size, int) for size in sizes) and math.prod(sizes) > MAX_STATES:
-        raise CheckpointError(
-            f"the file's plans would be of {math.prod(sizes)} states, which is larger than any agent's"
-        )
-
-
-def saved_spaces(checkpoint: Checkpoint) -> tuple[spaces.Box, spaces.Box]:
-    """Observation and action space of the saved agent."""
-    try:
-        return tuple(  # type: ignore[return-value]
-            spaces.Box(
-                checkpoint.tensors["agent"][f"{name}.low"].numpy(),
-                checkpoint.tensors["agent"][f"{name}.high"].numpy(),
-                dtype=np.dtype(checkpoint.config["space_dtypes"][name]).type,
-            )
-            for name in ("observation_space", "action_space")
-        )
-    except Exception as error:
-        raise CheckpointError(f"the file does not describe the spaces of its agent: {error!r}") from error
+def to_learn(agent: Any) -> dict[str, bool]:
+    """Which of reward and termination the user asked to be learned whatever the environment offers."""
+    return {name: getattr(agent, f"given_{name}") == LEARNED for name in ("reward_fn", "terminated_fn")}
 
 
 def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True, force_reset: bool = True) -> None:
@@ -217,6 +162,9 @@ def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True,
             part: {name: _number(value) for name, value in held.items()} for part, held in config["values"].items()
         }
         state: dict[str, Any] = {part: {**tensors, **values.get(part, {})} for part, tensors in parts.items()}
+        modelled = config.get("modelled", {"reward": False, "terminated": False})
+        if modelled != {"reward": agent.modelled.reward, "terminated": agent.modelled.terminated}:
+            agent.model(reward=bool(modelled["reward"]), terminated=bool(modelled["terminated"]))
         agent.dynamics.load_state_dict(state["dynamics"])
         agent.store.load_state_dict(state["transitions"])
         if keep_generators:
@@ -227,33 +175,39 @@ def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True,
         agent.ep_info_buffer = deque(config["episode_infos"], maxlen=agent.stats_window_size)
         agent.ep_success_buffer = deque(config["episode_successes"], maxlen=agent.stats_window_size)
         own = state["agent"]
-        carried = tuple(own[name].numpy() for name in ("plan.mean", "plan.std", "plan.age"))
-        (agent._carried,) = unpack(carried, agent.planning.cold, 1, agent.actions_per_plan)
+        _restore_running(agent, checkpoint, own)
         if checkpoint.schema > 1:
-            agent._record.number = agent._episode_num + 1
-            agent._record.load_state_dict({k.removeprefix("record."): v for k, v in own.items() if "record." in k})
             agent._pending_logs = [(str(n), _number(v), int(c), e) for n, v, c, e in config["pending_logs"]]
-        if not force_reset and "last_observation" in own:
+        if not force_reset and "last_observation" in own and len(own["last_observation"]) == agent.n_envs:
             agent._last_obs = own["last_observation"].numpy()
             agent._last_episode_starts = own["last_episode_starts"].numpy()
-    except CheckpointError:
+    except (CheckpointError, UnknownRewardError):
         raise
     except Exception as error:
         raise CheckpointError(f"the file does not fit a {type(agent).__name__} of its arguments: {error!r}") from error
 
 
+def _restore_running(agent: Any, checkpoint: Checkpoint, own: dict[str, Any]) -> None:
+    """The running episodes; those of another number of environments than the agent has now are given up."""
+    saved = saved_running(checkpoint)
+    carried = tuple(own[name].numpy() for name in ("plan.mean", "plan.std", "plan.age"))
+    plans = unpack(carried, agent.planning.cold, len(saved), agent.actions_per_plan)
+    if len(saved) != agent.n_envs:
+        has_explored = all(episode["has_explored"] for episode in saved)
+        agent._running = agent._no_episodes(has_explored=has_explored)
+        return
+    for index, (running, plan, episode) in enumerate(zip(agent._running, plans, saved, strict=True)):
+        running.carried, running.index, running.has_explored = plan, episode["index"], episode["has_explored"]
+        if checkpoint.schema > 1:
+            prefix = f"record.{index}." if checkpoint.schema > 2 else "record."
+            running.record.number = agent._episode_num + 1
+            running.record.load_state_dict(
+                {name.removeprefix(prefix): value for name, value in own.items() if name.startswith(prefix)}
+            )
+
+
 def encode(value: Any) -> Any:
     return {"observation_spec": asdict(value)} if isinstance(value, ObservationSpec) else value
-
-
-def _decode(value: Any) -> Any:
-    if not isinstance(value, dict):
-        return value
-    try:
-        fields = value["observation_spec"].items()
-        return ObservationSpec(**{name: tuple(map(int, indices)) for name, indices in fields})
-    except Exception as error:
-        raise CheckpointError(f"the file holds an argument that cannot be read: {value}") from error
 
 
 def _only_tensors(state: StateDict) -> dict[str, Tensor]:

@@ -1,40 +1,65 @@
-"""What the agent must know of its environment, found on it or given by the user, and checked at construction."""
+"""What the agent must know of its environment: given by the user, found on it, known of its class, or to be learned."""
 
-from collections.abc import Callable
-from copy import deepcopy
-from typing import Any, NamedTuple
+import warnings
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
-from torch import Tensor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecCheckNan,
+    VecEnv,
+    VecMonitor,
+    VecNormalize,
+    unwrap_vec_normalize,
+)
 
+from gym_dgpmpc.agents.dict_observations import GoalReward, flattened, goal_spec
 from gym_dgpmpc.agents.env_state import remember_starts
-from gym_dgpmpc.errors import UnknownRewardError
+from gym_dgpmpc.agents.first_batch import check_reward, check_termination
+from gym_dgpmpc.envs import known
 from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
 
-REWARD_SIGNATURE = "reward_fn(observation [*b, S], action [*b, A], next_observation [*b, S]) -> reward [*b]"
-TERMINATED_SIGNATURE = "terminated_fn(next_observation [*b, S]) -> terminated [*b], bool"
+Learned = Literal["learned"]
+LEARNED: Learned = "learned"
+Source = Literal["given", "the environment's", "compute_reward", "known", "never", "learned"]
+
+HARMLESS_VEC_WRAPPERS = (VecNormalize, VecMonitor, VecCheckNan)
+"""What leaves observations as they are (of VecNormalize: with norm_obs=False, which is all that is let in)."""
 
 
 class Task(NamedTuple):
-    """The functions that score a predicted trajectory, in raw environment units."""
+    """The functions that score a predicted trajectory, in raw environment units, and where they come from."""
 
-    reward_fn: RewardFn
+    reward_fn: RewardFn | None
+    """None: the model is to predict the reward."""
     terminated_fn: TerminatedFn | None
-    """None: as far as the planner knows, episodes do not end."""
+    """None: episodes do not end, or the model is to predict it; ``terminated_source`` tells."""
+    reward_source: Source = "given"
+    terminated_source: Source = "given"
+    is_reported: bool = True
+    """Whether ``reward_fn`` is meant to be the reward that the environment's `step` returns."""
+
+    def describe(self, *, can_learn_termination: bool = True) -> str:
+        """Where reward and termination come from, on one line, for a person."""
+        terminated: str = self.terminated_source
+        if terminated == LEARNED:
+            terminated = "learned, once an episode has terminated" if can_learn_termination else "unknown"
+        return f"reward: {self.reward_source} | termination: {terminated}"
 
 
 def wrapped_env(env: GymEnv | str) -> VecEnv:
     """The environment, or the registered one of this id, as a monitored VecEnv that can be planned for and resumed.
 
+    Dict observations come out of it as vectors.
+
     Raises:
         ValueError, AssertionError: see `check_env`.
     """
-    vec_env = BaseAlgorithm._wrap_env(maybe_make_env(env, 0))
+    vec_env = flattened(BaseAlgorithm._wrap_env(maybe_make_env(env, 0)))
     check_env(vec_env)
     remember_starts(vec_env)
     return vec_env
@@ -42,70 +67,123 @@ def wrapped_env(env: GymEnv | str) -> VecEnv:
 
 def find_task(
     env: VecEnv | None,
-    reward_fn: RewardFn | None,
-    terminated_fn: TerminatedFn | None,
-    both_spaces: tuple[spaces.Space, spaces.Space] | None = None,
+    reward_fn: RewardFn | Learned | None,
+    terminated_fn: TerminatedFn | Learned | None,
+    both_spaces: tuple[spaces.Box, spaces.Box],
+    device: torch.device | str = "cpu",
 ) -> Task:
-    """The reward and termination to plan with: what the user gave, else what the environment (if any) offers.
+    """The reward and termination to plan with, each from the first of these that has it.
+
+    What the user gave; what the environment offers as an attribute (a goal environment: `compute_reward`); what is
+    known of Gymnasium's own environments; else it must be learned. The user may ask for that with "learned". An
+    environment's ``terminated_fn = None`` says that its episodes never terminate.
 
     Raises:
-        UnknownRewardError: neither gives a reward function.
-        ValueError: a function does not return one value per state of a batch.
+        ValueError: a function does not return one finite value per state of a batch, on the device of the batch.
         TypeError: a function is not callable or does not return a tensor.
     """
-    if both_spaces is None and env is not None:
-        both_spaces = env.observation_space, env.action_space
-    assert both_spaces is not None, "find_task needs an environment or its spaces"
-    size = flat_size(both_spaces[0]), flat_size(both_spaces[1])
-    reward_fn = offered_by(env, "reward_fn") if reward_fn is None else reward_fn
-    terminated_fn = offered_by(env, "terminated_fn") if terminated_fn is None else terminated_fn
-    if reward_fn is None:
-        raise UnknownRewardError(
-            f"{describe(env)} has no attribute 'reward_fn' and none was passed. Planning scores predicted "
-            "trajectories, so it needs the reward as a function of batched torch tensors: pass reward_fn=... to the "
-            f"agent or give the environment that attribute, with the signature {REWARD_SIGNATURE} where S = {size[0]}, "
-            f"A = {size[1]} and *b stands for any leading dimensions"
-        )
-    observation, action, next_observation = _example_batch(*both_spaces)
-    _check_function("reward_fn", REWARD_SIGNATURE, reward_fn, (observation, action, next_observation), is_bool=False)
+    reward_fn, reward_source = _find_reward(env, reward_fn)
+    terminated_fn, terminated_source = _find_termination(env, terminated_fn)
+    if reward_fn is not None:
+        check_reward(reward_fn, *both_spaces, device)
     if terminated_fn is not None:
-        _check_function("terminated_fn", TERMINATED_SIGNATURE, terminated_fn, (next_observation,), is_bool=True)
-    return Task(reward_fn, terminated_fn)
+        check_termination(terminated_fn, *both_spaces, device)
+    is_reported = reward_source == "given" or not offered_by(env, "plans_with_another_reward")
+    return Task(reward_fn, terminated_fn, reward_source, terminated_source, is_reported)
+
+
+def _find_reward(env: VecEnv | None, given: RewardFn | Learned | None) -> tuple[RewardFn | None, Source]:
+    if isinstance(given, str):
+        _check_choice("reward_fn", given)
+        return None, LEARNED
+    if given is not None:
+        return given, "given"
+    offered = offered_by(env, "reward_fn")
+    if offered is not None:
+        return offered, "the environment's"
+    goal_reward = GoalReward.of(env)
+    if goal_reward is not None:
+        if offered_by(env, "reward_type") == "sparse":
+            warnings.warn(
+                f"{describe(env)} has sparse rewards, in which a planner has nothing to climb until it stands at the "
+                "goal by chance: its variant with dense rewards is the one to take",
+                stacklevel=2,
+            )
+        return goal_reward, "compute_reward"
+    task = known_task(env)
+    return (None, LEARNED) if task is None or task.reward_fn is None else (task.reward_fn, "known")
+
+
+def _find_termination(env: VecEnv | None, given: TerminatedFn | Learned | None) -> tuple[TerminatedFn | None, Source]:
+    if isinstance(given, str):
+        _check_choice("terminated_fn", given)
+        return None, LEARNED
+    if given is not None:
+        return given, "given"
+    if env is not None and env.has_attr("terminated_fn"):
+        offered = offered_by(env, "terminated_fn")
+        return offered, "never" if offered is None else "the environment's"
+    task = known_task(env)
+    if task is None:
+        return None, LEARNED
+    return task.terminated_fn, "never" if task.terminated_fn is None else "known"
+
+
+def _check_choice(name: str, given: str) -> None:
+    if given != LEARNED:
+        raise ValueError(f'{name} must be a function, "{LEARNED}" or None, got {given!r}')
 
 
 def find_observation_spec(env: VecEnv | None, observation_spec: ObservationSpec | None) -> ObservationSpec:
-    """How the dynamics model should read observations: as the user says, else the environment, else as they are."""
+    """How the dynamics model should read observations, found as `find_task` finds what it looks for.
+
+    Of a goal environment the goal is constant and no input; all else is read as it is.
+    """
     if observation_spec is None:
         observation_spec = offered_by(env, "observation_spec")
-    return ObservationSpec() if observation_spec is None else observation_spec
+    if observation_spec is not None:
+        return observation_spec
+    task = known_task(env)
+    return goal_spec(env) if task is None else task.observation_spec
+
+
+def known_task(env: VecEnv | None) -> known.KnownTask | None:
+    """What is known of the environment as one of Gymnasium's own, or None."""
+    while isinstance(env, HARMLESS_VEC_WRAPPERS):
+        env = env.venv
+    if env is None or env is not env.unwrapped:
+        return None
+    # One in another process cannot be looked at; its spec says how it was made.
+    found = env.envs[0] if isinstance(env, DummyVecEnv) else offered_by(env, "spec")
+    return None if found is None else known.find(found)
 
 
 def check_env(env: VecEnv) -> None:
     """Refuse what cannot be planned for, naming what was received.
 
     Raises:
-        ValueError: an observation that is not a vector of real numbers, an unbounded action, more than one
-            environment, or normalised observations.
+        ValueError: an observation that is not a vector of real numbers, an unbounded action, or normalised
+            observations.
         AssertionError: an action space that is not a Box, as from every SB3 algorithm.
     """
     observation, action = env.observation_space, env.action_space
     if not isinstance(observation, spaces.Box) or len(observation.shape) != 1 or observation.dtype.kind != "f":
         raise ValueError(
             "the dynamics model learns vectors of real numbers: the observation space must be a one-dimensional Box of "
-            f"floats, got {observation}. gymnasium.wrappers.FlattenObservation makes one of nested vectors; images are "
-            "not supported"
+            f"floats, or a Dict of such, got {observation}. gymnasium.wrappers.FlattenObservation makes one of nested "
+            "vectors; images are not supported"
         )
     assert isinstance(action, spaces.Box), (
         f"The algorithm only supports {spaces.Box} as action spaces but {action} was provided: "
         "the planner searches real-valued action sequences. For discrete actions see SB3's DQN or PPO"
     )
-    if not bool(np.all(np.isfinite(action.low) & np.isfinite(action.high) & (action.low <= action.high))):
+    bad = ~(np.isfinite(action.low) & np.isfinite(action.high) & (action.low <= action.high))
+    if bad.any():
+        where = "" if bad.all() else f" (those at {np.argwhere(bad).tolist()} are not)"
         raise ValueError(
-            f"the planner needs finite action bounds, got low = {action.low} and high = {action.high}; "
+            f"the planner needs finite action bounds{where}, got low = {action.low} and high = {action.high}; "
             "gymnasium.wrappers.RescaleAction or ClipAction can supply them"
         )
-    if env.num_envs != 1:
-        raise ValueError(f"the agent learns in one environment at a time, got a VecEnv with num_envs = {env.num_envs}")
     normalize = unwrap_vec_normalize(env)
     if isinstance(normalize, VecNormalize) and normalize.norm_obs:
         raise ValueError(
@@ -115,8 +193,17 @@ def check_env(env: VecEnv) -> None:
 
 
 def offered_by(env: VecEnv | None, name: str) -> Any:
-    """An attribute of the (single) environment under all its wrappers, or None."""
+    """An attribute of the (first) environment under all its wrappers, or None."""
     return env.get_attr(name)[0] if env is not None and env.has_attr(name) else None
+
+
+def environment_id(env: VecEnv | None) -> str | None:
+    """What `gymnasium.make` makes the environment from, once this package is imported; None if it is not registered."""
+    spec = offered_by(env, "spec")
+    if spec is None:
+        return None
+    is_robotics = str(spec.entry_point).startswith("gymnasium_robotics.")
+    return f"gym_dgpmpc.envs.robotics:{spec.id}" if is_robotics else spec.id
 
 
 def describe(env: VecEnv | None) -> str:
@@ -130,33 +217,3 @@ def describe(env: VecEnv | None) -> str:
 def flat_size(space: spaces.Space) -> int:
     """How many numbers an element of a Box holds."""
     return int(np.prod(space.shape or ()))
-
-
-def _example_batch(observation_space: spaces.Space, action_space: spaces.Space) -> tuple[Tensor, Tensor, Tensor]:
-    """Two-dimensional batches [3, 2] of observations, actions and next observations to try a function on."""
-    batch = []
-    for seed, space in enumerate((observation_space, action_space, observation_space)):
-        # A space of its own, so that the environment's sampling is not advanced.
-        box = deepcopy(space)
-        box.seed(seed)
-        samples = np.stack([box.sample().ravel() for _ in range(6)])
-        batch.append(torch.from_numpy(samples).float().reshape(3, 2, -1))
-    return batch[0], batch[1], batch[2]
-
-
-def _check_function(
-    name: str, signature: str, function: Callable[..., Tensor], batch: tuple[Tensor, ...], *, is_bool: bool
-) -> None:
-    if not callable(function):
-        raise TypeError(f"{name} must be a function {signature}, got {function!r}")
-    shapes = ", ".join(str(list(tensor.shape)) for tensor in batch)
-    kind = "bool" if is_bool else "float"
-    expected = f"{name} must map tensors of shapes {shapes} to a {kind} tensor [3, 2]; its signature is {signature}"
-    try:
-        value = function(*batch)
-    except Exception as error:
-        raise ValueError(f"{expected}. It raised {type(error).__name__}: {error}") from error
-    if not isinstance(value, Tensor):
-        raise TypeError(f"{expected}. It returned {type(value).__name__}")
-    if value.shape != (3, 2) or (value.dtype == torch.bool) != is_bool:
-        raise ValueError(f"{expected}. It returned {value.dtype} of shape {list(value.shape)}")

@@ -32,6 +32,9 @@ HARMLESS_WRAPPERS = (
 """Wrappers that intervene in `step` and leave observation, action, reward and termination as they are."""
 
 
+MONITOR = f"{Monitor.__module__}:{Monitor.__qualname__}"
+
+
 class KnownTask(NamedTuple):
     """What is known of an environment."""
 
@@ -50,11 +53,18 @@ def find(env: gym.Env | EnvSpec) -> KnownTask | None:
     own, but for `HARMLESS_WRAPPERS` and those that say so by an attribute ``keeps_task = True``.
 
     Args:
-        env: the environment with its wrappers, or the spec to make it from.
+        env: the environment with its wrappers, or the spec to make it from; of one whose wrappers do not record how
+            they were made, nothing is known.
     """
     if isinstance(env, EnvSpec):
         spec = deepcopy(env)
         spec.kwargs.pop("render_mode", None)
+        # SB3's monitor does not record how it was made, but leaves the task as it is.
+        spec.additional_wrappers = tuple(
+            wrapper for wrapper in spec.additional_wrappers if wrapper.entry_point != MONITOR
+        )
+        if any(wrapper.kwargs is None for wrapper in spec.additional_wrappers):
+            return None
         made = gym.make(spec)
         try:
             return find(made)

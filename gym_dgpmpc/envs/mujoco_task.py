@@ -12,6 +12,8 @@ from gymnasium import spaces
 from gymnasium.envs.mujoco import MujocoEnv
 from numpy.typing import NDArray
 
+from gym_dgpmpc.types import TerminatedFn
+
 
 class MujocoTask(MujocoEnv):
     """A MuJoCo environment of this package, without its task: `step` and `reset_model` are a subclass's.
@@ -31,6 +33,9 @@ class MujocoTask(MujocoEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}  # noqa: RUF012
+
+    terminated_fn: TerminatedFn | None = None
+    """None says that an episode never terminates; an environment that did not say so would have no such attribute."""
 
     def __init__(
         self,

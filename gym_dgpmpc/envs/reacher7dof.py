@@ -247,6 +247,10 @@ class Reacher7DoFEnv(MujocoTask, utils.EzPickle):
         self._has_stepped = False
         return super().reset(seed=seed, options=options)
 
+    def options_to_reset(self, again: bool) -> dict[str, int]:
+        """The options with which `reset` begins the present episode again, or the one that would come next."""
+        return {"episode": self._episode if again else self._episode + self._has_stepped}
+
     def reset_model(self) -> NDArray[np.float64]:
         """Stretch the arm and draw a target; see the class's description for its distribution."""
         generator = self.np_random

@@ -11,6 +11,7 @@ from numpy import ndarray
 from stable_baselines3.common.callbacks import BaseCallback
 
 from gym_dgpmpc.agents import MPCAgent
+from gym_dgpmpc.agents.dict_observations import flatten
 from gym_dgpmpc.agents.randomness import derive_seed
 from gym_dgpmpc.planning.rollout import rollout
 from gym_dgpmpc.reporting.figures import Forecast
@@ -37,7 +38,7 @@ class EpisodeRecorder(gymnasium.Wrapper):
     A long episode's pictures are thinned out, evenly, so that its GIF keeps the true speed at a readable size.
 
     Args:
-        env: an environment with vector observations and actions.
+        env: an environment with observations that are vectors, or dicts of such, and actions that are vectors.
         on_end: called with each episode that ends.
     """
 
@@ -64,13 +65,13 @@ class EpisodeRecorder(gymnasium.Wrapper):
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(**kwargs)
-        self._observations, self._actions, self._rewards, self._frames = [np.array(observation)], [], [], []
+        self._observations, self._actions, self._rewards, self._frames = [np.array(flatten(observation))], [], [], []
         self._add_frame()
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         result = observation, reward, terminated, truncated, _ = self.env.step(action)
-        self._observations.append(np.array(observation))
+        self._observations.append(np.array(flatten(observation)))
         self._actions.append(np.array(action))
         self._rewards.append(float(reward))
         if self.num_steps % self._steps_per_frame == 0:
@@ -128,12 +129,14 @@ class ForecastCallback(BaseCallback):
 
     def _compare(self, episode: Episode, start: int) -> Forecast:
         """What the worlds drawn at a step make of the actions that were taken from it, beside what they led to."""
+        modelled = self.agent.modelled
         actions = episode.actions[start : start + self.horizon].reshape(1, -1, episode.actions[0].size)
         predicted = rollout(
             self._worlds[start],
-            torch.as_tensor(episode.observations[start], dtype=torch.float32, device=self.agent.device),
+            torch.as_tensor(modelled.start(episode.observations[start]), dtype=torch.float32, device=self.agent.device),
             torch.as_tensor(actions, dtype=torch.float32, device=self.agent.device),
             self.num_particles,
         )
         observed = episode.observations[start : start + actions.shape[1] + 1]
-        return Forecast(start, predicted[:, :, 0].cpu().numpy(), observed)
+        states = predicted[:, :, 0, : modelled.observation_size]
+        return Forecast(start, states.cpu().numpy(), observed)

@@ -92,6 +92,8 @@ class RiskSensitiveReward(gym.Wrapper, RecordConstructorArgs):
         self._penalty, self._penalise_step = AnglePenalty(angle_index, float(angle_step)), penalise_step
         self.reward_fn: RewardFn = PenalisedReward(_reward_of(env), self._penalty)
         """The penalised reward, batched."""
+        self.plans_with_another_reward = not penalise_step
+        """Whether `step` deliberately returns another reward than `reward_fn`."""
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step the environment; both rewards are in the info."""

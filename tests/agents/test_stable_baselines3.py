@@ -102,6 +102,7 @@ def test_progress_bar(capsys):
 def test_one_readable_line_per_episode(capsys):
     agent(verbose=1).learn(25)
     lines = capsys.readouterr().out.splitlines()
+    assert lines.pop(0) == "reward: the environment's | termination: unknown"
     assert len(lines) == 2
     assert re.fullmatch(r"episode +1 \| +10 steps \| return +-\d+\.\d\d \| +\d+\.\d s \| random actions", lines[0])
     assert re.fullmatch(

@@ -1,0 +1,154 @@
+"""Dict observations as vectors, and what goal environments know of themselves.
+
+A Dict of vectors becomes one vector: its parts in the alphabetical order of their keys, so that a goal environment's
+is (achieved_goal, desired_goal, observation).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from jaxtyping import Float
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from torch import Tensor
+
+from gym_dgpmpc.types import ObservationSpec
+
+ACHIEVED, DESIRED = "achieved_goal", "desired_goal"
+
+REPEATS_ACHIEVED_GOAL = ("gymnasium_robotics.envs.fetch.", "gymnasium_robotics.envs.maze.point_maze")
+"""Modules of the environments whose observation holds the achieved goal once more."""
+
+
+class FlatDict(VecEnvWrapper):
+    """A VecEnv of Dict observations as one of vectors.
+
+    Args:
+        venv: its observation space must be a Dict of one-dimensional Boxes of floats.
+
+    Raises:
+        ValueError: it is not.
+    """
+
+    def __init__(self, venv: VecEnv):
+        space = venv.observation_space
+        assert isinstance(space, spaces.Dict), f"FlatDict is for Dict observations, got {space}"
+        for key, part in space.items():
+            if not isinstance(part, spaces.Box) or len(part.shape) != 1 or part.dtype.kind != "f":
+                raise ValueError(
+                    "of a Dict of observations every part must be a one-dimensional Box of floats, got "
+                    f"{part} for {key!r}. gymnasium.wrappers.FilterObservation leaves parts out, FlattenObservation "
+                    "makes one vector of nested ones; images are not supported"
+                )
+        boxes = [space[key] for key in sorted(space.spaces)]
+        low, high = (np.concatenate([getattr(box, name) for box in boxes]) for name in ("low", "high"))
+        super().__init__(venv, spaces.Box(low, high, dtype=low.dtype.type))
+        self.layout = layout_of(space)
+
+    def reset(self) -> np.ndarray:
+        return flatten(self.venv.reset())
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        observation, rewards, dones, infos = self.venv.step_wait()
+        flat_infos = [
+            {**info, "terminal_observation": flatten(info["terminal_observation"])}
+            if "terminal_observation" in info
+            else info
+            for info in infos
+        ]
+        return flatten(observation), rewards, dones, flat_infos
+
+
+def flattened(env: VecEnv) -> VecEnv:
+    """The same with vectors in place of Dict observations; others are left as they are."""
+    return FlatDict(env) if isinstance(env.observation_space, spaces.Dict) else env
+
+
+def flatten(observation: Any) -> Any:
+    """The parts of a Dict observation, or of a batch of them, along the last dimension; others are left as they are."""
+    if not isinstance(observation, Mapping):
+        return observation
+    return np.concatenate([np.asarray(observation[key]) for key in sorted(observation)], axis=-1)
+
+
+def layout_of(space: spaces.Space) -> dict[str, slice]:
+    """Where in the vector the parts of a Dict space are."""
+    assert isinstance(space, spaces.Dict)
+    layout, start = {}, 0
+    for key in sorted(space.spaces):
+        size = int(np.prod(space[key].shape or ()))
+        layout[key] = slice(start, start + size)
+        start += size
+    return layout
+
+
+def layout(env: VecEnv | None) -> dict[str, slice]:
+    """Where in the vectors of a `FlatDict` the parts are; empty in every other environment."""
+    while isinstance(env, VecEnvWrapper):
+        if isinstance(env, FlatDict):
+            return env.layout
+        env = env.venv
+    return {}
+
+
+def goal_spec(env: VecEnv | None) -> ObservationSpec:
+    """How to read a goal environment's vectors: the goal stays for an episode, and nothing but the reward feels it.
+
+    Hindsight relabelling assumes the same. Where the observation holds the achieved goal too, one of them is no input.
+    """
+    parts = layout(env)
+    if DESIRED not in parts:
+        return ObservationSpec()
+    assert env is not None
+    goal = _indices(parts[DESIRED])
+    module = type(env.get_attr("unwrapped")[0]).__module__ if hasattr(env.unwrapped, "envs") else ""
+    repeated = _indices(parts[ACHIEVED]) if module.startswith(REPEATS_ACHIEVED_GOAL) else ()
+    return ObservationSpec(constant=goal, not_inputs=(*repeated, *goal))
+
+
+@dataclass(frozen=True)
+class GoalReward:
+    """A goal environment's `compute_reward` as a `gym_dgpmpc.types.RewardFn`: of the goal achieved by the step.
+
+    Attributes:
+        compute_reward: (achieved [*b, G], desired [*b, G], info) -> [*b], in NumPy, as hindsight relabelling has it.
+        achieved: where in the vector the achieved goal is.
+        desired: where the desired one is.
+    """
+
+    compute_reward: Callable[[np.ndarray, np.ndarray, dict[str, Any]], Any]
+    achieved: slice
+    desired: slice
+
+    @classmethod
+    def of(cls, env: VecEnv | None) -> "GoalReward | None":
+        """That of an environment with both goals and the method; None of any other."""
+        parts = layout(env)
+        if env is None or not {ACHIEVED, DESIRED} <= set(parts) or not env.has_attr("compute_reward"):
+            return None
+
+        def compute_reward(achieved: np.ndarray, desired: np.ndarray, info: dict[str, Any]) -> Any:
+            # By the name of the method, so that it may be in another process.
+            return env.env_method("compute_reward", achieved, desired, info, indices=[0])[0]
+
+        return cls(compute_reward, parts[ACHIEVED], parts[DESIRED])
+
+    def __call__(
+        self,
+        observation: Float[Tensor, "*b S"],
+        action: Float[Tensor, "*b A"],
+        next_observation: Float[Tensor, "*b S"],
+    ) -> Float[Tensor, "*b"]:
+        """The reward of each step; ``observation`` and ``action`` play no part."""
+        achieved, desired = (
+            next_observation[..., part].double().cpu().numpy() for part in (self.achieved, self.desired)
+        )
+        reward = np.asarray(self.compute_reward(achieved, desired, {}))
+        return torch.as_tensor(reward, dtype=next_observation.dtype, device=next_observation.device)
+
+
+def _indices(part: slice) -> tuple[int, ...]:
+    return tuple(range(part.start, part.stop))

@@ -1,0 +1,120 @@
+"""Trying a reward or termination function on a batch of states before anything is learned with it."""
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+REWARD_SIGNATURE = "reward_fn(observation [*b, S], action [*b, A], next_observation [*b, S]) -> reward [*b]"
+TERMINATED_SIGNATURE = "terminated_fn(next_observation [*b, S]) -> terminated [*b], bool"
+
+SHAPE = (3, 2)
+"""Of the batch, which has two dimensions because the planner's has three: one alone would hide a fixed axis."""
+WIDEST = 1e6
+"""Bounds further apart than this are no statement about what values occur."""
+
+
+def check_reward(
+    reward_fn: Callable[..., Tensor],
+    observation_space: spaces.Box,
+    action_space: spaces.Box,
+    device: torch.device | str,
+) -> None:
+    """Try a reward function, and say what does not fit.
+
+    Warns if it is not finite for some observations in a space that does not say what values occur.
+
+    Raises:
+        ValueError: it raises, or returns another shape, dtype or device, or what is not finite.
+        TypeError: it is not callable or does not return a tensor.
+    """
+    batch = example_batch(observation_space, action_space, device)
+    reward = _tried("reward_fn", REWARD_SIGNATURE, reward_fn, batch, is_bool=False)
+    bad = ~reward.isfinite()
+    if not bad.any():
+        return
+    first = tuple(bad.nonzero()[0].tolist())
+    told = ", ".join(
+        f"{name} = {tensor[first].tolist()}"
+        for name, tensor in zip(("observation", "action", "next_observation"), batch, strict=True)
+    )
+    message = f"reward_fn must return finite numbers, but returned {reward[first].item()} for {told}"
+    says_what_occurs = bool((observation_space.high - observation_space.low < WIDEST).all())
+    if says_what_occurs or bad.all():
+        raise ValueError(
+            f"{message}; these are from within the spaces {observation_space} and {action_space}. What the model "
+            "predicts can be as far off, so the function has to be finite there too"
+        )
+    warnings.warn(
+        f"{message}. If such observations can be predicted, plans that lead to them will never be taken", stacklevel=4
+    )
+
+
+def check_termination(
+    terminated_fn: Callable[..., Tensor],
+    observation_space: spaces.Box,
+    action_space: spaces.Box,
+    device: torch.device | str,
+) -> None:
+    """Try a termination function, and say what does not fit.
+
+    Raises:
+        ValueError: it raises, or returns another shape, dtype or device.
+        TypeError: it is not callable or does not return a tensor.
+    """
+    _, _, after = example_batch(observation_space, action_space, device)
+    _tried("terminated_fn", TERMINATED_SIGNATURE, terminated_fn, (after,), is_bool=True)
+
+
+def example_batch(
+    observation_space: spaces.Box, action_space: spaces.Box, device: torch.device | str = "cpu"
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Batches [3, 2] of observations, actions and next observations, float32.
+
+    Uniform between bounds; where there are none, or so wide ones that they say nothing, normal about the place nearest
+    to zero that is allowed. The spaces' own random numbers are not advanced.
+    """
+    generator = np.random.default_rng(0)
+    both = (observation_space, action_space, observation_space)
+    drawn = [_sample(space, generator).astype(np.float32) for space in both]
+    observation, action, after = (torch.as_tensor(each, device=device).reshape(*SHAPE, -1) for each in drawn)
+    return observation, action, after
+
+
+def _sample(space: spaces.Box, generator: np.random.Generator) -> np.ndarray:
+    low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
+    shape = (int(np.prod(SHAPE)), low.size)
+    with np.errstate(over="ignore"):
+        bounded = high - low < WIDEST
+    uniform = np.where(bounded, low, 0.0) + np.where(bounded, high - low, 1.0) * generator.random(shape)
+    # Around zero, or around a bound that excludes it, on the side that is allowed.
+    normal = np.clip(0.0, low, high) + generator.standard_normal(shape)
+    return np.where(bounded, uniform, np.clip(normal, low, high))
+
+
+def _tried(
+    name: str, signature: str, function: Callable[..., Tensor], batch: tuple[Tensor, ...], *, is_bool: bool
+) -> Tensor:
+    if not callable(function):
+        raise TypeError(f"{name} must be a function {signature}, got {function!r}")
+    shapes = ", ".join(str(list(tensor.shape)) for tensor in batch)
+    kind = "bool" if is_bool else "float"
+    expected = f"{name} must map tensors of shapes {shapes} to a {kind} tensor {list(SHAPE)}; its signature is "
+    expected += signature
+    try:
+        value = function(*batch)
+    except Exception as error:
+        raise ValueError(f"{expected}. It raised {type(error).__name__}: {error}") from error
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{expected}. It returned {type(value).__name__}")
+    right_kind = value.dtype == torch.bool if is_bool else value.is_floating_point()
+    if value.shape != SHAPE or not right_kind:
+        raise ValueError(f"{expected}. It returned {value.dtype} of shape {list(value.shape)}")
+    if value.device != batch[0].device:
+        raise ValueError(
+            f"{expected}, on the device of the batch, {batch[0].device}. It returned one on {value.device}"
+        )
+    return value
