@@ -26,7 +26,7 @@ class DGPMPCAgent(MPCAgent):
     The paper's settings of a task are in `presets.PAPER`: ``DGPMPCAgent(env, **PAPER["ModCartPole-v0"])``.
 
     Args:
-        env: the environment, its id, or a VecEnv of one environment; actions a bounded Box, observations a vector.
+        env: the environment, its id, or a VecEnv; actions a bounded Box, observations a vector or a Dict of vectors.
         num_layers: L, layers of the deep GP.
         kernel: of every layer: "rbf", "matern52", "matern32" or "matern12".
         num_inducing: M, inducing points per layer.
@@ -49,13 +49,17 @@ class DGPMPCAgent(MPCAgent):
         num_elites: the best of them, that the next iteration starts from; default: a tenth.
         num_iterations: the most iterations of a plan.
         actions_per_plan: actions performed of each plan before the next one is made.
-        learning_starts: environment steps of uniform random actions; default: those of one episode.
+        learning_starts: transitions before the first training, of random actions if they were not logged; default:
+            those of one episode in each environment.
+        train_freq: environment steps between two trainings; default: one at every episode's start.
         compile: roll plans out in compiled code, which a C++ compiler builds once in a few seconds; without one, or on
             another device than the CPU, PyTorch does it, several times slower. Not saved with the agent.
         time_budget: seconds that a plan may take, or None; see `MPCAgent`.
-        reward_fn: r(s, a, s'), batched over leading dimensions, in torch; default: the environment's ``reward_fn``.
-        terminated_fn: whether an episode ends in s', batched likewise; default: the environment's ``terminated_fn``.
-        observation_spec: how the model reads observations; default: the environment's ``observation_spec``.
+        reward_fn: r(s, a, s'), batched over leading dimensions, in torch. None: what the environment offers or is
+            known to have; if there is none, or with "learned", the model predicts it.
+        terminated_fn: whether an episode ends in s', batched likewise. None: as for the reward; what must be learned is
+            so from the first termination on.
+        observation_spec: how the model reads observations; default: what the environment offers or is known to need.
         stats_window_size: episodes that the logged means are over.
         tensorboard_log: folder for TensorBoard, or None.
         verbose: 0 for silence, 1 for one line per episode, 2 for SB3's tables of logged values besides.
@@ -66,7 +70,7 @@ class DGPMPCAgent(MPCAgent):
     Raises:
         ValueError: an argument is out of its range, or the environment is one that cannot be planned for.
         AssertionError: the action space is not a Box, as from every SB3 algorithm.
-        UnknownRewardError: there is no reward function.
+        UnknownRewardError: of a loaded agent: the reward function that it was given is missing.
     """
 
     saved_arguments: ClassVar[tuple[str, ...]] = (

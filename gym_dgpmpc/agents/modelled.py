@@ -24,7 +24,10 @@ class Component:
     index: int
 
     def __call__(
-        self, observation: Float[Tensor, "*b V"], action: Float[Tensor, "*b A"], next_observation: Float[Tensor, "*b V"]
+        self,
+        observation: Float[Tensor, "*b S_all"],
+        action: Float[Tensor, "*b A"],
+        next_observation: Float[Tensor, "*b S_all"],
     ) -> Float[Tensor, "*b"]:
         return next_observation[..., self.index]
 
@@ -35,13 +38,13 @@ class ComponentAboveHalf:
 
     index: int
 
-    def __call__(self, next_observation: Float[Tensor, "*b V"]) -> Bool[Tensor, "*b"]:
+    def __call__(self, next_observation: Float[Tensor, "*b S_all"]) -> Bool[Tensor, "*b"]:
         return next_observation[..., self.index] > 0.5
 
 
 @dataclass(frozen=True)
 class ModelledVector:
-    """(observation, reward if it is predicted, termination if it is predicted), size V.
+    """(observation, reward if it is predicted, termination if it is predicted), of S_all numbers.
 
     Attributes:
         observation_size: S.
@@ -57,7 +60,7 @@ class ModelledVector:
 
     @property
     def size(self) -> int:
-        """V."""
+        """S_all."""
         return self.observation_size + self.reward + self.terminated
 
     @property
@@ -79,7 +82,7 @@ class ModelledVector:
             torch.cat([observation, torch.zeros_like(column)], dim=-1), action, torch.cat([after, column], dim=-1)
         )
 
-    def start(self, observation: Float[np.ndarray, " S"]) -> Float[np.ndarray, " V"]:
+    def start(self, observation: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S_all"]:
         """The vector from which a plan starts."""
         return np.pad(observation, (0, self.size - self.observation_size))
 
@@ -112,7 +115,10 @@ class _OfObservation:
     size: int
 
     def __call__(
-        self, observation: Float[Tensor, "*b V"], action: Float[Tensor, "*b A"], next_observation: Float[Tensor, "*b V"]
+        self,
+        observation: Float[Tensor, "*b S_all"],
+        action: Float[Tensor, "*b A"],
+        next_observation: Float[Tensor, "*b S_all"],
     ) -> Float[Tensor, "*b"]:
         return self.reward_fn(observation[..., : self.size], action, next_observation[..., : self.size])
 
@@ -124,5 +130,5 @@ class _EndOfObservation:
     terminated_fn: TerminatedFn
     size: int
 
-    def __call__(self, next_observation: Float[Tensor, "*b V"]) -> Bool[Tensor, "*b"]:
+    def __call__(self, next_observation: Float[Tensor, "*b S_all"]) -> Bool[Tensor, "*b"]:
         return self.terminated_fn(next_observation[..., : self.size])

@@ -34,16 +34,28 @@ class MPCAgent(ActingAgent):
     `predict` carries the plan in SB3's recurrent state, as a warm start for the next step: pass on the state that it
     returns (`evaluate_policy` does). Without it every step is planned from scratch, which costs return.
 
+    In a VecEnv of n environments each is planned for by itself, in worlds that they share, so a step takes n plans; all
+    transitions go into one store, and the model is re-sampled once for each step of all.
+
     Args:
-        env: the environment, its id, or a VecEnv of one environment; actions a bounded Box, observations a vector.
-        dynamics: the model to learn.
+        env: the environment, its id, or a VecEnv; actions a bounded Box, observations a vector or a Dict of vectors.
+        dynamics: the model to learn; or a function (observation size, action size, `ObservationSpec`) -> model, which
+            is needed if the model has to predict reward or termination too, and may be called again when that is found.
         planner: the optimiser of action sequences; its horizon is the plan's.
-        reward_fn: r(s, a, s'), batched over leading dimensions, in torch; default: the environment's ``reward_fn``.
-        terminated_fn: whether an episode ends in s', batched likewise; default: the environment's ``terminated_fn``,
-            and if it has none, the planner takes episodes not to end.
+        reward_fn: r(s, a, s'), batched over leading dimensions, in torch. None: the environment's ``reward_fn`` or
+            `compute_reward`, or what is known of Gymnasium's own; if there is none, or with "learned", the model
+            predicts it.
+        terminated_fn: whether an episode ends in s', batched likewise. None: the environment's ``terminated_fn`` (which
+            may be None: never), or what is known; if there is none, or with "learned", the model predicts it from the
+            first termination on.
+        observation_spec: how a model that ``dynamics`` makes reads observations; default: the environment's
+            ``observation_spec``, or what is known. Of a Dict it means the vector of the parts in alphabetical order.
         num_particles: P, worlds drawn for each plan.
         actions_per_plan: actions performed of each plan before the next one is made.
-        learning_starts: environment steps of uniform random actions; default: those of one episode.
+        learning_starts: transitions before the first training, of random actions if they were not logged; default:
+            those of one episode in each environment.
+        train_freq: environment steps between two trainings, for tasks that never end or whose episodes are very long
+            or very short; default: one at every episode's start.
         time_budget: seconds that a plan may take, drawing its worlds included; the best plan found by then is used.
             None: as long as it takes. With a budget the clock decides, so a run does not repeat itself exactly.
         stats_window_size: episodes that the logged means are over.
@@ -56,7 +68,7 @@ class MPCAgent(ActingAgent):
     Raises:
         ValueError: an argument is out of its range, or the environment is one that cannot be planned for.
         AssertionError: the action space is not a Box, as from every SB3 algorithm.
-        UnknownRewardError: there is no reward function.
+        UnknownRewardError: there is no reward function, and the model cannot be given the reward to predict.
     """
 
     def _setup_model(self) -> None:
@@ -92,7 +104,8 @@ class MPCAgent(ActingAgent):
 
         With a ``run_folder`` they are on disk too: a checkpoint is written after every episode, the last two are kept,
         and one more is written if something fails. ``resume=True`` makes the same call, in a program that was killed
-        and started again, go on from there, to the same result bit for bit:
+        and started again, go on from there, to the same result bit for bit (of several environments: with all data
+        and the same model, in new episodes):
 
             agent = DGPMPCAgent("ModCartPole-v0", seed=0, tensorboard_log="runs/a/logs")
             agent.learn(total_timesteps=3_200, run_folder="runs/a", resume=True)

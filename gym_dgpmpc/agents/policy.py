@@ -86,7 +86,7 @@ class PlanningPolicy:
 
         Args:
             task: the reward and termination to plan with, as functions of what the model predicts.
-            observation: [V], as the model sees it.
+            observation: [S_all], as the model sees it (see `modelled.py`).
             state: what the last step of the same episode returned, or `cold`.
             generator: for the worlds and the planner.
             worlds: of `worlds`; None draws some for this plan alone.

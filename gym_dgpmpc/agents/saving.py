@@ -164,7 +164,7 @@ def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True,
         state: dict[str, Any] = {part: {**tensors, **values.get(part, {})} for part, tensors in parts.items()}
         modelled = config.get("modelled", {"reward": False, "terminated": False})
         if modelled != {"reward": agent.modelled.reward, "terminated": agent.modelled.terminated}:
-            agent.model(reward=bool(modelled["reward"]), terminated=bool(modelled["terminated"]))
+            _model_as_saved(agent, modelled)
         agent.dynamics.load_state_dict(state["dynamics"])
         agent.store.load_state_dict(state["transitions"])
         if keep_generators:
@@ -181,10 +181,20 @@ def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True,
         if not force_reset and "last_observation" in own and len(own["last_observation"]) == agent.n_envs:
             agent._last_obs = own["last_observation"].numpy()
             agent._last_episode_starts = own["last_episode_starts"].numpy()
-    except (CheckpointError, UnknownRewardError):
+    except CheckpointError:
         raise
     except Exception as error:
         raise CheckpointError(f"the file does not fit a {type(agent).__name__} of its arguments: {error!r}") from error
+
+
+def _model_as_saved(agent: Any, modelled: dict[str, bool]) -> None:
+    """Make the agent's model anew, to predict what the saved one did."""
+    try:
+        agent.model(reward=bool(modelled["reward"]), terminated=bool(modelled["terminated"]))
+    except UnknownRewardError as error:
+        raise CheckpointError(
+            "the file's model predicts the reward or termination too: pass dynamics=... as the function that made it"
+        ) from error
 
 
 def _restore_running(agent: Any, checkpoint: Checkpoint, own: dict[str, Any]) -> None:

@@ -140,7 +140,7 @@ def test_what_the_agent_looks_for(env):
     # and its 2 free rolls are read as sine and cosine.
     sizes = {4: (6, 4), 17: (17 - 3 + 2 + 7, 14), 18: (24, 18)}
     assert (encoder.input_size, encoder.target_size) == sizes[size[0]]
-    assert not env.has_wrapper_attr("terminated_fn")
+    assert env.get_wrapper_attr("terminated_fn") is None  # says that it never terminates
     observations, _, _ = play(env, uniform_actions(env.action_space, 5, seed=0), seed=0)
     assert np.all(np.ptp(observations, axis=0)[list(spec.constant)] == 0)
     # Angles are the hinges that turn freely, and no others.

@@ -10,7 +10,7 @@ from tensorboard.compat.proto.event_pb2 import Event
 
 from gym_dgpmpc.agents.checkpoint import read_checkpoint
 
-CLOCK = {"record.seconds", "record.plan_seconds"}
+CLOCK = {"record.0.seconds", "record.0.plan_seconds"}
 """Tensors of a checkpoint that tell the time."""
 CLOCK_TAGS = ("time/", "train/seconds")
 
