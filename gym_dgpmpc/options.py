@@ -86,6 +86,9 @@ TimeBudget = Annotated[
 LearningStarts = Annotated[
     int | None, _training("--random-steps", "Environment steps of random actions at first.", "those of one episode")
 ]
+TrainFreq = Annotated[
+    int | None, _training("--train-freq", "Environment steps between two trainings.", "one at every episode's start")
+]
 FirstTraining = Annotated[
     int | None,
     _training("--first-training", "Iterations of the first training.", "4000"),

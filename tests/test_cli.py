@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from gym_dgpmpc import cli, options
 from gym_dgpmpc.agents import DGPMPCAgent
+from gym_dgpmpc.agents.checkpoint import read_checkpoint
 from gym_dgpmpc.agents.presets import PAPER
 from gym_dgpmpc.dynamics.deep_gp_draws import DRAWS, REFRESHES
 from gym_dgpmpc.gp.kernels import KERNELS
@@ -141,7 +142,6 @@ def test_interruption(run, monkeypatch):
         (["NoSuchEnv-v0"], ["NoSuchEnv"]),
         (["no_such_module:Env-v0"], ["no_such_module"]),
         (["CartPole-v1"], ["action spaces", "Discrete"]),
-        (["ToyPushWithoutReward-v0"], ["ToyPushWithoutReward-v0", "reward_fn"]),
         (["ToyPushForever-v0"], ["no time limit", "--timesteps"]),
         (["ToyPush-v0", "--episodes", "1", "--timesteps", "5"], ["either --episodes or --timesteps"]),
         (["ToyPush-v0", "--candidates", "5", "--elites", "6"], ["6"]),
@@ -151,6 +151,21 @@ def test_interruption(run, monkeypatch):
 def test_train_says_what_is_wrong(run, tmp_path, arguments, texts):
     assert is_one_line_error(run("train", *arguments, "--no-video"), *texts)
     assert [path for path in tmp_path.rglob("*.*") if path.name != ".lock"] == []
+
+
+def test_a_reward_that_nobody_knows_is_learned(run, drawable):
+    result = run("train", "ToyPushWithoutReward-v0", *SMALLEST, "--episodes", 1, "--out", "a")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith("reward: learned | termination: learned, once an episode has terminated\n")
+    evaluated = run("evaluate", "a", "--episodes", 1)
+    assert evaluated.exit_code == 0, evaluated.output
+
+
+def test_a_task_without_end(run):
+    often = ["--timesteps", 30, "--random-steps", 8, "--train-freq", 9, "--no-video", "--out", "a"]
+    assert run("train", "ToyPushForever-v0", *SMALLEST, *often).exit_code == 0
+    checkpoint = read_checkpoint("a/agent.zip")
+    assert checkpoint.config["counters"]["num_fitted"] == 26
 
 
 def test_an_error_without_words_says_where_it_was(run, monkeypatch):

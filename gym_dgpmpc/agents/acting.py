@@ -16,6 +16,7 @@ from gym_dgpmpc.agents.env_state import episode_start
 from gym_dgpmpc.agents.episode import EpisodeRecord
 from gym_dgpmpc.agents.logged import Logged, read_logged
 from gym_dgpmpc.agents.running import RunningEpisode, next_episode
+from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 
 
@@ -66,8 +67,10 @@ class ActingAgent(PlanningAgent):
             TypeError: the data are none of these.
         """
         rows = read_logged(data, scaled_actions, self.observation_space, self.action_space)
-        episode = next_episode(self.store, self._running)
-        self.store.extend(*rows[:3], reward=rows.reward, terminated=rows.terminated, episode=rows.episode + episode)
+        episode = rows.episode + next_episode(self.store, self._running)
+        # First into a store of their own, whose errors count steps from the first one that is added.
+        for store in (TransitionStore(self.store.observation_size, self.store.action_size), self.store):
+            store.extend(*rows[:3], reward=rows.reward, terminated=rows.terminated, episode=episode)
         for running in self._running:
             running.has_explored = True
 

@@ -129,7 +129,7 @@ class PlanningAgent(ComposedAgent):
     def load(
         cls: type[SelfAgent],
         path: CheckpointPath,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         device: torch.device | str = "cpu",
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
@@ -140,7 +140,8 @@ class PlanningAgent(ComposedAgent):
 
         Args:
             path: what `save` was given.
-            env: the environment to go on in; None serves prediction, and then a reward function must be given.
+            env: the environment to go on in, or its id; None serves prediction, and then a reward that was not learned
+                must be given.
             device: where planning computes.
             custom_objects: of SB3's signature; without effect, since nothing is unpickled.
             print_system_info: print versions of this system.

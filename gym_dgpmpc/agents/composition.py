@@ -12,6 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from gym_dgpmpc.agents.first_batch import REWARD_SIGNATURE
 from gym_dgpmpc.agents.modelled import ModelledVector
@@ -196,10 +197,10 @@ class ComposedAgent(BaseAlgorithm):
             raise self._unknown_reward()
         return self._task
 
-    def _unknown_reward(self) -> UnknownRewardError:
-        """The error that says what to pass."""
+    def _unknown_reward(self, env: VecEnv | None = None) -> UnknownRewardError:
+        """The error that says what to pass, of an environment in place of the agent's own."""
         return UnknownRewardError(
-            f"{describe(self.env)} has no attribute 'reward_fn' and none was passed; nor does this agent's dynamics "
+            f"{describe(self.env if env is None else env)} has no attribute 'reward_fn' and none was passed; nor does this agent's dynamics "
             "model predict the reward, which takes dynamics=... as a function (observation_size, action_size, "
             "observation_spec) -> model in place of a ready-made model. Planning scores predicted trajectories, so it "
             "needs the reward as a function of batched torch tensors: pass reward_fn=... to the agent or give the "
@@ -219,8 +220,8 @@ class ComposedAgent(BaseAlgorithm):
         both_spaces = self.observation_space, self.action_space
         task = find_task(env, self.given_reward_fn, self.given_terminated_fn, both_spaces, self.device)
         if task.reward_fn is None and not self.modelled.reward:
-            if self.is_fitted:
-                raise self._unknown_reward()
+            if self.is_fitted or not self._can_model_more:
+                raise self._unknown_reward(env)
             self.model(reward=True, terminated=self.modelled.terminated)
         self.n_envs = env.num_envs  # which may be another number than before
         super().set_env(env, force_reset)

@@ -5,6 +5,7 @@ import json
 import os
 import pickle
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -344,6 +345,21 @@ def test_sizes_are_bounded(saved, tmp_path, monkeypatch):
 def test_contents_that_do_not_fit_are_named(change, message, saved, tmp_path):
     with pytest.raises(CheckpointError, match=message):
         load(changed(saved, tmp_path / "changed.zip", change))
+
+
+def test_a_file_of_the_second_schema_goes_on():
+    """Written within an episode, by the package before it knew of several environments and of learned rewards."""
+    from tests.reporting import toy
+
+    path = Path(__file__).parent / "files" / "schema2.zip"
+    assert read_checkpoint(path).schema == 2
+    loaded = MPCAgent.load(path, env=toy.gymnasium.make("ToyPush-v0"))
+    (running,) = loaded._running
+    assert (running.index, running.has_explored, len(running.record.rewards)) == (2, True, 1)
+    assert not loaded.modelled.reward and loaded.train_freq is None
+    assert loaded.num_timesteps == len(loaded.store) == 2 * toy.EPISODE_STEPS + 1
+    loaded.learn(toy.EPISODE_STEPS, reset_num_timesteps=False)
+    assert loaded.store.episodes.unique().tolist() == [0, 1, 2, 3]
 
 
 def test_classes_are_checked(saved, tmp_path):

@@ -73,7 +73,7 @@ def test_an_unknown_reward_says_what_to_pass():
         agent(PointMass())
     learner = agent(PointMass(), reward_fn=reward_fn).learn(12)
     assert learner.task.reward_fn is reward_fn
-    with pytest.raises(UnknownRewardError, match="PointMass"):
+    with pytest.raises(UnknownRewardError, match="<PointMass"):
         agent(KnownPointMass()).set_env(PointMass())
 
 

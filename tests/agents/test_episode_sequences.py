@@ -64,7 +64,7 @@ def test_a_resumed_run_is_the_whole_one(stop, tmp_path):
 
 def test_where_an_episode_cannot_go_on_the_next_one_begins(tmp_path):
     agent(Plant()).learn(23, run_folder=tmp_path)
-    assert starts(agent(Plant()).learn(45, run_folder=tmp_path, resume=True)) == [0, 1, 2, 3, 4]
+    assert starts(agent(Plant()).learn(45, run_folder=tmp_path, resume=True)) == [0, 1, 2, 3, 4, 5]
 
 
 @pytest.mark.parametrize(("stop", "expected"), [(20, [0, 1, 2, 3]), (23, [0, 1, 2, 2, 3])])

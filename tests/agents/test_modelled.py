@@ -93,10 +93,10 @@ def test_a_learned_reward_scores_as_the_known_one_does():
     env = Linear(fixed_start=True)
     learner = agent(env, dynamics=linear).learn(3 * LENGTH)
     assert learner.task.reward_source == "learned" and learner.modelled.reward
-    sampler = learner.dynamics.draw(5, 5, torch.Generator().manual_seed(0))
     states, actions = [torch.zeros(5, 8, 3)], torch.linspace(-2, 2, 40).reshape(8, 5, 1)
     states[0][..., 0] = 0.7
     with torch.no_grad():
+        sampler = learner.dynamics.draw(5, 5, torch.Generator().manual_seed(0))
         for step in range(5):
             states.append(sampler(states[-1], actions[:, step], step))
     states = torch.stack(states)
