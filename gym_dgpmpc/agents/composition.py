@@ -200,11 +200,12 @@ class ComposedAgent(BaseAlgorithm):
     def _unknown_reward(self, env: VecEnv | None = None) -> UnknownRewardError:
         """The error that says what to pass, of an environment in place of the agent's own."""
         return UnknownRewardError(
-            f"{describe(self.env if env is None else env)} has no attribute 'reward_fn' and none was passed; nor does this agent's dynamics "
-            "model predict the reward, which takes dynamics=... as a function (observation_size, action_size, "
-            "observation_spec) -> model in place of a ready-made model. Planning scores predicted trajectories, so it "
-            "needs the reward as a function of batched torch tensors: pass reward_fn=... to the agent or give the "
-            f"environment that attribute, with the signature {REWARD_SIGNATURE} where S = "
+            f"{describe(self.env if env is None else env)} has no attribute 'reward_fn' and none was passed; nor was "
+            "this agent's model made to predict the reward (a ready-made one cannot be: pass dynamics=... as a function "
+            "of observation size, action size and observation spec that makes one). Planning scores predicted "
+            "trajectories, so it needs the reward as a function of batched torch tensors: pass reward_fn=... to the "
+            "agent or give the environment that attribute, with the signature "
+            f"{REWARD_SIGNATURE} where S = "
             f"{flat_size(self.observation_space)}, A = {flat_size(self.action_space)} and *b stands for any leading "
             "dimensions"
         )
