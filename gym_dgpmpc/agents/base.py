@@ -200,9 +200,7 @@ class PlanningAgent(BaseAlgorithm):
         late = self.planning.num_late
         action, after, _ = self.planning.plan(self.task, observation, before, generator)
         if self.planning.num_late > late:
-            self._warn_once(
-                f"a plan took longer than its time_budget of {self.time_budget} s; num_late_plans counts them"
-            )
+            self._warn_once(f"a plan took longer than the time_budget of {self.time_budget} s: see num_late_plans")
         return action, after
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -260,7 +258,7 @@ class PlanningAgent(BaseAlgorithm):
     def load(
         cls: type[SelfAgent],
         path: CheckpointPath,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         device: torch.device | str = "cpu",
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
@@ -271,7 +269,7 @@ class PlanningAgent(BaseAlgorithm):
 
         Args:
             path: what `save` was given.
-            env: the environment to go on in; None serves prediction, and then a reward function must be given.
+            env: the environment to go on in, or its id; None serves prediction, and then the reward must be given.
             device: where planning computes.
             custom_objects: of SB3's signature; without effect, since nothing is unpickled.
             print_system_info: print versions of this system.
