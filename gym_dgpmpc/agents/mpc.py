@@ -74,6 +74,13 @@ class MPCAgent(PlanningAgent):
             return False
         return not self._explored_episode if self.learning_starts is None else len(self.store) < self.learning_starts
 
+    @property
+    def is_training_due(self) -> bool:
+        """Whether `learn` would begin by training: an episode or exploration has ended, and brought transitions."""
+        starts = self._last_episode_starts is not None and bool(self._last_episode_starts[0])
+        due = not self.is_exploring and (starts or not self.is_fitted)
+        return due and len(self.store) > self.num_fitted
+
     def learn(
         self: SelfAgent,
         total_timesteps: int,
@@ -199,8 +206,7 @@ class MPCAgent(PlanningAgent):
 
     def _fit_if_due(self) -> None:
         """Train if an episode ended, or exploration did, and there is something new to learn from."""
-        due = not self.is_exploring and (self._starts_episode or not self.is_fitted)
-        if not due or len(self.store) == self.num_fitted:
+        if not self.is_training_due:
             return
         started = time.perf_counter()
         with nullcontext() if self._safeguard is None else self._safeguard.stop.at_any_time():

@@ -73,6 +73,8 @@ class Safeguard:
             if error is None:
                 if self._saved != self._present():
                     self._save()
+                if self.stop.received is not None:  # after the last step
+                    self.stop.stop()
             elif isinstance(error, Exception):
                 try:
                     self._save(gives_up=True)
