@@ -11,6 +11,7 @@ environment itself, and of a plain `MPCAgent` the objects it was composed of.
 import importlib.metadata
 import inspect
 import math
+import os
 from collections import deque
 from dataclasses import asdict
 from importlib import import_module
@@ -78,6 +79,7 @@ def collect(agent: Any, *, gives_up: bool = False) -> Checkpoint:
         "counters": {name: getattr(agent, name) for name in COUNTERS},
         "episode": None if start is None else {**start, "goes_on": goes_on},
         "pending_logs": _pending_logs(agent),
+        "log_run": _log_run(agent),
         "episode_infos": [_plain(info) for info in agent.ep_info_buffer or ()][-MAX_EPISODE_INFOS:],
         "episode_successes": [float(success) for success in agent.ep_success_buffer or ()],
         "values": {part: _without_tensors(state) for part, state in tensors.items()},
@@ -232,6 +234,7 @@ def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True,
         if checkpoint.schema > 1:
             agent._record.number = agent._episode_num + 1
             agent._record.load_state_dict({k.removeprefix("record."): v for k, v in own.items() if "record." in k})
+            agent._log_run = config["log_run"]
             agent._pending_logs = [(str(n), _number(v), int(c), e) for n, v, c, e in config["pending_logs"]]
         if not force_reset and "last_observation" in own:
             agent._last_obs = own["last_observation"].numpy()
@@ -274,6 +277,12 @@ def _pending_logs(agent: Any) -> list[tuple[str, Any, int, Any]]:
         for name, value in list(logger.name_to_value.items())
         if isinstance(value, int | float | np.number)
     ]
+
+
+def _log_run(agent: Any) -> str | None:
+    """The folder's name, under the agent's ``tensorboard_log``, that it logs in."""
+    logger = getattr(agent, "_logger", None)
+    return agent._log_run if logger is None or agent.tensorboard_log is None else os.path.basename(logger.dir)
 
 
 def _json_number(value: Any) -> Any:

@@ -221,7 +221,7 @@ class TrainingRun:
                 steps_of_call,
                 callback,
                 tb_log_name=LOG_NAME,
-                reset_num_timesteps=False,
+                reset_num_timesteps=not self.folder.checkpoints.exist,
                 progress_bar=progress_bar and steps_of_call > 0,
                 run_folder=self.folder.checkpoints,
                 checkpoint_every=self.checkpoint_every,
