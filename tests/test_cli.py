@@ -144,7 +144,7 @@ def test_signals_end_a_run_with_their_exit_codes(run, tmp_path, monkeypatch, num
     step = ToyPush.step
 
     def step_with_signal(self, action):
-        if self.time == 3 and (tmp_path / "a" / "agent.zip").exists():
+        if self.time == 3 and (tmp_path / "a" / "agent.previous.zip").exists():  # after an episode
             os.kill(os.getpid(), number)
         return step(self, action)
 
@@ -167,7 +167,7 @@ def test_a_folder_in_use_and_a_failing_environment_are_one_line(run, tmp_path, m
     step = ToyPush.step
 
     def failing(self, action):
-        if self.time == 5 and (tmp_path / "a" / "agent.zip").exists():
+        if self.time == 5 and (tmp_path / "a" / "agent.previous.zip").exists():  # after an episode
             raise ConnectionError("the plant is gone")
         return step(self, action)
 
