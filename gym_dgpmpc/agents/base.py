@@ -89,9 +89,7 @@ class PlanningAgent(ComposedAgent):
         task, start = self.modelled.task(self.task), self.modelled.start(observation)
         action, after, _ = self.planning.plan(task, start, before, generator)
         if self.planning.num_late > late:
-            self._warn_once(
-                f"a plan took longer than its time_budget of {self.time_budget} s; num_late_plans counts them"
-            )
+            self._warn_once(f"a plan took longer than the time_budget of {self.time_budget} s: see num_late_plans")
         return action, after
 
     def dump_logs(self) -> None:

@@ -201,8 +201,8 @@ class ComposedAgent(BaseAlgorithm):
         """The error that says what to pass, of an environment in place of the agent's own."""
         return UnknownRewardError(
             f"{describe(self.env if env is None else env)} has no attribute 'reward_fn' and none was passed; nor was "
-            "this agent's model made to predict the reward (a ready-made one cannot be: pass dynamics=... as a function "
-            "of observation size, action size and observation spec that makes one). Planning scores predicted "
+            "this agent's model made to predict the reward (a ready-made one cannot be: pass dynamics=... as a "
+            "function of observation size, action size and observation spec that makes one). Planning scores predicted "
             "trajectories, so it needs the reward as a function of batched torch tensors: pass reward_fn=... to the "
             "agent or give the environment that attribute, with the signature "
             f"{REWARD_SIGNATURE} where S = "

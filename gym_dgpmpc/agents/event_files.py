@@ -2,20 +2,16 @@
 
 from pathlib import Path
 
-from stable_baselines3.common.utils import get_latest_run_id
 from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
 from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.summary.writer.record_writer import RecordWriter
 
-from gym_dgpmpc.agents.files import replace_file
+from gym_dgpmpc.agents.files import remove_temporaries, replace_file
 
 
-def drop_events_after(step: int, tensorboard_log: str, tb_log_name: str) -> None:
-    """Remove the points beyond ``step`` from the run that Stable-Baselines3 will append to.
-
-    A last point that a kill cut in two is removed with them.
-    """
-    run = Path(tensorboard_log) / f"{tb_log_name}_{get_latest_run_id(tensorboard_log, tb_log_name)}"
+def drop_events_after(step: int, run: Path) -> None:
+    """Remove the points beyond ``step`` from a folder of logs; a last one that a kill cut in two goes with them."""
+    remove_temporaries(run)
     for path in sorted(run.glob("events.out.tfevents.*")):
         if path.stat().st_size == 0:  # killed before its first record; the reader takes an empty file for an error
             path.unlink()

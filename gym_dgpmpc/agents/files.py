@@ -1,6 +1,7 @@
 """Writing files so that a kill, a full disk or a power cut leaves either the old one or the new one, whole."""
 
 import os
+import re
 import secrets
 from collections.abc import Callable
 from pathlib import Path
@@ -45,10 +46,11 @@ def replace_text(target: Path, text: str) -> None:
     replace_file(target, write)
 
 
-def remove_temporaries(folder: Path, name: str) -> None:
-    """Remove what killed writers of ``name`` left behind; only for who knows that no other is writing."""
-    for path in folder.glob(f".{name}.*{TEMPORARY}"):
-        path.unlink(missing_ok=True)
+def remove_temporaries(folder: Path) -> None:
+    """Remove what killed writers left behind in a folder; only for who knows that no other is writing there."""
+    for path in folder.glob(f".*{TEMPORARY}"):
+        if re.search(rf"\.[0-9a-f]{{8}}{TEMPORARY}$", path.name):
+            path.unlink(missing_ok=True)
 
 
 def _keep(target: Path, previous: Path) -> None:

@@ -74,8 +74,17 @@ class MPCAgent(ActingAgent):
     def _setup_model(self) -> None:
         super()._setup_model()
         self._pending_logs: list[tuple[str, float, int, Any]] = []  # of a checkpoint, for the logger of `learn`
+        self._log_run: str | None = None  # of a checkpoint: the folder under `tensorboard_log` that it logs in
         self._safeguard: Safeguard | None = None
         self._has_described = False  # whether it was said where reward and termination come from
+
+    @property
+    def is_training_due(self) -> bool:
+        """Whether `learn` would begin by training: an episode or exploration has ended, or ``train_freq`` is reached."""
+        num_new = len(self.store) - self.num_fitted
+        starts = self._last_episode_starts is not None and bool(self._last_episode_starts.any())
+        due = starts if self.train_freq is None else num_new >= self.train_freq
+        return num_new > 0 and not self.is_exploring and (due or not self.is_fitted)
 
     def learn(
         self: SelfAgent,
@@ -102,10 +111,10 @@ class MPCAgent(ActingAgent):
 
         Whatever goes wrong, the transitions observed so far stay in ``agent.store``, and `learn` can be called again.
 
-        With a ``run_folder`` they are on disk too: a checkpoint is written after every episode, the last two are kept,
-        and one more is written if something fails. ``resume=True`` makes the same call, in a program that was killed
-        and started again, go on from there, to the same result bit for bit (of several environments: with all data
-        and the same model, in new episodes):
+        With a ``run_folder`` they are on disk too: a checkpoint is written at first and after every episode, the last
+        two are kept, and one more is written if something fails. ``resume=True`` makes the same call, in a program that
+        was killed and started again, go on from there, to the same result bit for bit (of several environments: with
+        all data and the same model, in new episodes):
 
             agent = DGPMPCAgent("ModCartPole-v0", seed=0, tensorboard_log="runs/a/logs")
             agent.learn(total_timesteps=3_200, run_folder="runs/a", resume=True)
@@ -118,7 +127,7 @@ class MPCAgent(ActingAgent):
             callback: SB3 callback(s), called after each step.
             log_interval: episodes between two writings of the log.
             tb_log_name: name of the run's folder under ``tensorboard_log``.
-            reset_num_timesteps: start counting from zero, with a new episode; without effect with ``resume``.
+            reset_num_timesteps: start counting from zero, with a new episode; a run that goes on never does.
             progress_bar: show one.
             run_folder: where to keep checkpoints, for this process alone.
             resume: go on from the checkpoint in ``run_folder``; without one the run begins.
@@ -142,13 +151,15 @@ class MPCAgent(ActingAgent):
         if run_folder is not None:
             guard = Safeguard(self, run_folder, resume=resume, checkpoint_every=checkpoint_every)
         with guard as self._safeguard:
-            if resume:
-                total_timesteps, reset_num_timesteps = max(total_timesteps - self.num_timesteps, 0), False
-            if self._safeguard is not None and not reset_num_timesteps:
+            if self._safeguard is not None and self._safeguard.goes_on:
+                total_timesteps -= self.num_timesteps if resume else 0
+                reset_num_timesteps = False
                 continue_logs(self, tb_log_name)
             total_timesteps, callback = self._setup_learn(
-                total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+                max(total_timesteps, 0), callback, reset_num_timesteps, tb_log_name, progress_bar
             )
+            if self._safeguard is not None:
+                self._safeguard.begin()
             callback.on_training_start(locals(), globals())
             self._control(total_timesteps, callback, log_interval)
             callback.on_training_end()
@@ -206,9 +217,7 @@ class MPCAgent(ActingAgent):
 
     def _fit_if_due(self) -> None:
         """Train if an episode ended (or enough was seen since the last time), or exploration did."""
-        num_new = len(self.store) - self.num_fitted
-        due = bool(self._starts.any()) if self.train_freq is None else num_new >= self.train_freq
-        if self.is_exploring or not num_new or not (due or not self.is_fitted):
+        if not self.is_training_due:
             return
         if not self.is_fitted:
             for disagreement in disagreements(self.task, self.store, self.device):

@@ -48,8 +48,7 @@ class RunCheckpoints:
             raise CheckpointWriteError(
                 error.errno, f"the folder {self.folder} cannot be written to: {error.strerror or error}"
             ) from error
-        for name in (NEWEST, PREVIOUS):
-            remove_temporaries(self.folder, name)
+        remove_temporaries(self.folder)
 
     def __enter__(self) -> "RunCheckpoints":
         return self

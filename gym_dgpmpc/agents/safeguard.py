@@ -3,8 +3,11 @@
 import os
 import warnings
 from contextlib import ExitStack
+from pathlib import Path
 from types import TracebackType
 from typing import Any
+
+from stable_baselines3.common.utils import get_latest_run_id
 
 from gym_dgpmpc.agents.env_state import can_replay, episode_start
 from gym_dgpmpc.agents.event_files import drop_events_after
@@ -18,8 +21,9 @@ from gym_dgpmpc.errors import CheckpointError, ReliabilityWarning
 class Safeguard:
     """A context around one call of `MPCAgent.learn` with a run's folder.
 
-    On entering, the folder is taken hold of, and the agent goes on from it if it should. Inside, `after_step` writes
-    checkpoints and heeds requests to stop. On an exception everything gathered so far is written.
+    On entering, the folder is taken hold of, and the agent goes on from it if it should. Inside, `begin` writes a first
+    checkpoint, so that a run killed within its first episode is known to be one; `after_step` writes checkpoints and
+    heeds requests to stop. On an exception everything gathered so far is written.
 
     Args:
         agent: the `MPCAgent` that learns.
@@ -62,6 +66,7 @@ class Safeguard:
                     )
             if self.resume:
                 resume_from(self.agent, self.checkpoints)
+            self._goes_on = self.checkpoints.exist
             stack.enter_context(self.stop)
             self._stack = stack.pop_all()
         return self
@@ -73,6 +78,8 @@ class Safeguard:
             if error is None:
                 if self._saved != self._present():
                     self._save()
+                if self.stop.received is not None:  # after the last step
+                    self.stop.stop()
             elif isinstance(error, Exception):
                 try:
                     self._save(gives_up=True)
@@ -80,6 +87,16 @@ class Safeguard:
                     warnings.warn(
                         f"no checkpoint could be written after that error: {another}", ReliabilityWarning, stacklevel=2
                     )
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the folder held a run, which the agent goes on with."""
+        return self._goes_on
+
+    def begin(self) -> None:
+        """Write the first checkpoint of a run."""
+        if not self._goes_on:
+            self._save()
 
     def after_step(self, *, episode_ended: bool) -> None:
         """Write a checkpoint if one is due, and stop if that was asked for.
@@ -129,6 +146,18 @@ def resume_from(agent: Any, checkpoints: RunCheckpoints) -> bool:
 
 
 def continue_logs(agent: Any, tb_log_name: str) -> None:
-    """Drop what was logged after the agent's checkpoint, for it will be logged again; see `event_files`."""
-    if agent.tensorboard_log is not None and os.path.isdir(agent.tensorboard_log):
-        drop_events_after(agent.num_timesteps, agent.tensorboard_log, tb_log_name)
+    """Drop what was logged after the agent's checkpoint, for it will be logged again; see `event_files`.
+
+    Stable-Baselines3 goes on in the newest folder of that name: if it is not the run's, nothing is dropped.
+    """
+    if agent.tensorboard_log is None or agent._log_run is None:
+        return
+    newest = f"{tb_log_name}_{get_latest_run_id(agent.tensorboard_log, tb_log_name)}"
+    if newest == agent._log_run:
+        drop_events_after(agent.num_timesteps, Path(agent.tensorboard_log) / newest)
+    elif os.path.isdir(os.path.join(agent.tensorboard_log, agent._log_run)):
+        warnings.warn(
+            f"the run has logged in {agent._log_run}, but {newest} is newer: the curve goes on there",
+            ReliabilityWarning,
+            stacklevel=2,
+        )

@@ -10,6 +10,7 @@ environment itself, and of a plain `MPCAgent` the objects it was composed of.
 
 import importlib.metadata
 import math
+import os
 from collections import deque
 from dataclasses import asdict
 from typing import Any
@@ -80,6 +81,7 @@ def collect(agent: Any, *, gives_up: bool = False) -> Checkpoint:
         "reset_options": options_to_reset(agent.env, again=True),
         "episode": None if start is None else {**start, "goes_on": goes_on},
         "pending_logs": _pending_logs(agent),
+        "log_run": _log_run(agent),
         "episode_infos": [_plain(info) for info in agent.ep_info_buffer or ()][-MAX_EPISODE_INFOS:],
         "episode_successes": [float(success) for success in agent.ep_success_buffer or ()],
         "values": {part: _without_tensors(state) for part, state in tensors.items()},
@@ -177,6 +179,7 @@ def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True,
         own = state["agent"]
         _restore_running(agent, checkpoint, own)
         if checkpoint.schema > 1:
+            agent._log_run = config.get("log_run")
             agent._pending_logs = [(str(n), _number(v), int(c), e) for n, v, c, e in config["pending_logs"]]
         if not force_reset and "last_observation" in own and len(own["last_observation"]) == agent.n_envs:
             agent._last_obs = own["last_observation"].numpy()
@@ -238,6 +241,12 @@ def _pending_logs(agent: Any) -> list[tuple[str, Any, int, Any]]:
         for name, value in list(logger.name_to_value.items())
         if isinstance(value, int | float | np.number)
     ]
+
+
+def _log_run(agent: Any) -> str | None:
+    """The folder's name, under the agent's ``tensorboard_log``, that it logs in."""
+    logger = getattr(agent, "_logger", None)
+    return agent._log_run if logger is None or agent.tensorboard_log is None else os.path.basename(logger.dir)
 
 
 def _json_number(value: Any) -> Any:

@@ -197,8 +197,7 @@ class TrainingRun:
     @property
     def is_complete(self) -> bool:
         """Whether everything that was asked for has been done before."""
-        has_learned = self.agent.num_fitted == len(self.agent.store) or self.agent.is_exploring
-        return self._has_enough and has_learned
+        return self._has_enough and not self.agent.is_training_due
 
     @property
     def _has_enough(self) -> bool:
@@ -222,7 +221,7 @@ class TrainingRun:
                 steps_of_call,
                 callback,
                 tb_log_name=LOG_NAME,
-                reset_num_timesteps=False,
+                reset_num_timesteps=not self.folder.checkpoints.exist,
                 progress_bar=progress_bar and steps_of_call > 0,
                 run_folder=self.folder.checkpoints,
                 checkpoint_every=self.checkpoint_every,

@@ -4,6 +4,7 @@ import io
 import json
 import os
 import pickle
+import shutil
 import zipfile
 from pathlib import Path
 
@@ -360,6 +361,33 @@ def test_a_file_of_the_second_schema_goes_on():
     assert loaded.num_timesteps == len(loaded.store) == 2 * toy.EPISODE_STEPS + 1
     loaded.learn(toy.EPISODE_STEPS, reset_num_timesteps=False)
     assert loaded.store.episodes.unique().tolist() == [0, 1, 2, 3]
+
+
+def test_a_file_of_the_first_schema_goes_on():
+    """Written by the package before it kept what a running episode needs."""
+    from gym_dgpmpc import DGPMPCAgent
+    from tests.reporting.toy import EPISODE_STEPS, SMALLEST_AGENT
+
+    path = Path(__file__).parent / "files" / "schema1.zip"
+    assert read_checkpoint(path).schema == 1
+    loaded = MPCAgent.load(path, env="ToyPush-v0")
+    assert isinstance(loaded, DGPMPCAgent)
+    assert loaded.num_timesteps == len(loaded.store) == loaded.num_fitted == 2 * EPISODE_STEPS
+    assert loaded.num_inducing == SMALLEST_AGENT["num_inducing"]
+    assert loaded.time_budget is None
+    assert loaded.action_space.contains(loaded.predict(np.zeros(2), deterministic=True)[0])
+    assert len(loaded.learn(EPISODE_STEPS, reset_num_timesteps=False).store) == 3 * EPISODE_STEPS
+
+
+def test_a_run_of_the_first_schema_goes_on(tmp_path):
+    from gym_dgpmpc import DGPMPCAgent
+    from tests.reporting.toy import EPISODE_STEPS, SMALLEST_AGENT
+
+    shutil.copy(Path(__file__).parent / "files" / "schema1.zip", tmp_path / "agent.zip")
+    learner = DGPMPCAgent("ToyPush-v0", seed=0, **SMALLEST_AGENT)
+    learner.learn(3 * EPISODE_STEPS, run_folder=tmp_path, resume=True)
+    assert learner.num_timesteps == 3 * EPISODE_STEPS
+    assert read_checkpoint(tmp_path / "agent.zip").schema == 3
 
 
 def test_classes_are_checked(saved, tmp_path):

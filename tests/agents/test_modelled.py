@@ -225,9 +225,9 @@ def test_the_first_termination_makes_the_model_begin_anew():
 
 
 def test_a_model_that_was_ready_made_cannot_be_given_more_to_predict():
-    with pytest.raises(UnknownRewardError, match=r"a ready-made one cannot be: pass dynamics=\.\.\. as a function"):
+    with pytest.raises(UnknownRewardError, match=r"a ready-made one cannot be: pass dynamics=\.\.\. as a"):
         agent(PointMass())
-    with pytest.raises(UnknownRewardError, match=r"a ready-made one cannot be: pass dynamics=\.\.\. as a function"):
+    with pytest.raises(UnknownRewardError, match=r"a ready-made one cannot be: pass dynamics=\.\.\. as a"):
         agent(KnownPointMass(), reward_fn="learned")
 
 

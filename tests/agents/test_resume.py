@@ -400,7 +400,8 @@ def test_a_second_signal_stops_at_once(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         learner.learn(TOTAL, Impatient(), run_folder=tmp_path)
-    assert not (tmp_path / "agent.zip").exists()
+    with RunCheckpoints(tmp_path) as held:
+        assert held.load().config["counters"]["num_timesteps"] == 0
 
 
 def test_outside_the_main_thread_there_are_no_signals_to_handle(tmp_path):

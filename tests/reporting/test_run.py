@@ -81,6 +81,39 @@ def test_goes_on(tmp_path):
     assert len(DGPMPCAgent.load(run.folder.agent_file).store) == 48
 
 
+@pytest.mark.parametrize("total", [24, 30])
+def test_a_run_that_was_killed_before_its_last_training_is_not_complete(tmp_path, monkeypatch, total):
+    def run_of(total_timesteps):
+        HOLDERS[:] = [holder.close() for holder in HOLDERS][:0]
+        folder = RunFolder(tmp_path, SETTINGS)
+        HOLDERS.append(folder)
+        env = gymnasium.make("ToyPush-v0")
+        run = TrainingRun(folder, env, SMALLEST_AGENT | {"seed": 0}, num_episodes=None, total_timesteps=total_timesteps)
+        folder.write_settings()
+        return run
+
+    run = run_of(total)
+    fit = run.agent.dynamics.fit
+
+    def killed_in_the_second(data, generator):
+        if len(data.action) == 24:
+            raise KeyboardInterrupt
+        return fit(data, generator)
+
+    monkeypatch.setattr(run.agent.dynamics, "fit", killed_in_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        run.train(progress_bar=False)
+    assert (tmp_path / "prediction_fan.png").exists() == (
+        total == 24
+    )  # drawn before the checkpoint of the last episode
+    run = run_of(total)
+    assert not run.is_complete
+    run.train(progress_bar=False)
+    assert run.agent.num_timesteps == total
+    assert run.agent.num_fitted == 24
+    assert run_of(total).is_complete
+
+
 class InterruptAt(BaseCallback):
     def __init__(self, step):
         super().__init__()
