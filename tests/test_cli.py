@@ -11,6 +11,7 @@ import subprocess
 import sys
 import typing
 
+import gymnasium
 import pytest
 from typer.testing import CliRunner
 
@@ -22,6 +23,8 @@ from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
 from gym_dgpmpc.dynamics.deep_gp_draws import DRAWS, REFRESHES
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.reporting import rendering
+from tests.agents.point_mass import LENGTH
+from tests.agents.test_goals import Goal
 from tests.reporting.toy import ENV_ID, ToyPush
 
 SMALLEST = ["--layers=1", "--inducing=4", "--features=4", "--particles=2", "--horizon=3", "--candidates=6"]
@@ -203,6 +206,18 @@ def test_a_reward_that_nobody_knows_is_learned(run, drawable):
     assert result.stdout.startswith("reward: learned | termination: learned, once an episode has terminated\n")
     evaluated = run("evaluate", "a", "--episodes", 1)
     assert evaluated.exit_code == 0, evaluated.output
+
+
+def test_a_task_with_a_goal(run):
+    """Its observations are dicts; its forecasts, figures and rows are those of vectors."""
+    gymnasium.register("GoalOfTheTests-v0", Goal, max_episode_steps=LENGTH)
+    try:
+        result = run("train", "GoalOfTheTests-v0", *SMALLEST, "--episodes", 1, "--no-video", "--out", "a")
+        assert result.exit_code == 0, result.output
+        assert "prediction_fan.png" in result.stdout
+        assert run("evaluate", "a", "--episodes", 1).exit_code == 0
+    finally:
+        del gymnasium.registry["GoalOfTheTests-v0"]
 
 
 def test_a_task_without_end(run):

@@ -14,6 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
+from gym_dgpmpc.agents.dict_observations import FlatDict
 from gym_dgpmpc.agents.first_batch import REWARD_SIGNATURE
 from gym_dgpmpc.agents.modelled import ModelledVector
 from gym_dgpmpc.agents.policy import PlanningPolicy
@@ -209,6 +210,10 @@ class ComposedAgent(BaseAlgorithm):
             f"{flat_size(self.observation_space)}, A = {flat_size(self.action_space)} and *b stands for any leading "
             "dimensions"
         )
+
+    def get_env(self) -> VecEnv | None:
+        """The environment as a VecEnv, with the Dict observations that it may have."""
+        return self.env.venv if isinstance(self.env, FlatDict) else self.env
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Go on in another environment of the same spaces; its reward is planned with, unless one was given.

@@ -80,7 +80,7 @@ class MPCAgent(ActingAgent):
 
     @property
     def is_training_due(self) -> bool:
-        """Whether `learn` would begin by training: an episode or exploration has ended, or ``train_freq`` is reached."""
+        """Whether `learn` would begin by training: an episode or exploration has ended, or ``train_freq`` is due."""
         num_new = len(self.store) - self.num_fitted
         starts = self._last_episode_starts is not None and bool(self._last_episode_starts.any())
         due = starts if self.train_freq is None else num_new >= self.train_freq

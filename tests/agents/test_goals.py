@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -56,6 +57,19 @@ class Goal(gym.Env):
 
     def observe(self):
         return {"observation": self.state.copy(), "achieved_goal": self.state[:1].copy(), "desired_goal": self.goal}
+
+
+def logged():
+    """An episode of random actions."""
+    env, generator, steps = Goal(), np.random.default_rng(0), []
+    before, _ = env.reset(seed=0)
+    for _ in range(LENGTH):
+        action = generator.uniform(-2, 2, 1)
+        after, reward, *_ = env.step(action)
+        steps.append((flatten(before), action, flatten(after), reward))
+        before = after
+    names = ("observation", "action", "next_observation", "reward")
+    return dict(zip(names, map(np.array, zip(*steps, strict=True)), strict=True))
 
 
 OBSERVATION = {
@@ -166,6 +180,18 @@ def test_sb3s_helpers_take_dicts(tmp_path):
         learner.predict({"observation": np.zeros(2)})
     with pytest.raises(EnvironmentDataError, match="not finite"):
         learner.predict({**OBSERVATION, "observation": np.array([np.nan, 0.0])})
+
+
+@pytest.mark.filterwarnings("error")
+def test_evaluation_while_it_learns():
+    watched = agent(Goal())
+    watched.add_transitions(logged())
+    watch = EvalCallback(Monitor(Goal()), eval_freq=7, n_eval_episodes=1, verbose=0)
+    watched.learn(2 * LENGTH, callback=watch)
+    assert watch.last_mean_reward > -10.0
+    assert isinstance(watched.get_env().observation_space, spaces.Dict)
+    watched.set_env(watched.get_env())
+    assert len(watched.learn(LENGTH, reset_num_timesteps=False).store) == 4 * LENGTH
 
 
 def test_saved_loaded_and_resumed(tmp_path):
