@@ -106,7 +106,7 @@ class ComposedAgent(BaseAlgorithm):
         )
         self.verbose, self.stats_window_size = verbose, stats_window_size
         self._dynamics_factory: DynamicsFactory | None = None
-        if isinstance(dynamics, DynamicsModel):
+        if isinstance(dynamics, DynamicsModel) and not isinstance(dynamics, type):  # a class makes models
             self.dynamics = dynamics
         else:
             self._dynamics_factory = dynamics
@@ -131,7 +131,7 @@ class ComposedAgent(BaseAlgorithm):
         self._task: Task | None = None
         if self.env is not None or self.given_reward_fn is not None:
             self._task = self._find_task()
-        self.model(reward=self._task is not None and self._task.reward_fn is None)
+        self.new_model(reward=self._task is not None and self._task.reward_fn is None)
         if not hasattr(self, "dynamics") or not hasattr(self, "planner"):
             raise ValueError("an MPCAgent is made of a dynamics model and a planner: pass dynamics=... and planner=...")
         self.planning = PlanningPolicy(
@@ -152,7 +152,7 @@ class ComposedAgent(BaseAlgorithm):
         factory = self._dynamics_factory
         return None if factory is None else factory(observation_size, action_size, observation_spec)
 
-    def model(self, *, reward: bool, terminated: bool = False) -> None:
+    def new_model(self, *, reward: bool, terminated: bool = False) -> None:
         """Begin with an untrained model, of the observation and what else it is to predict.
 
         Raises:
@@ -228,7 +228,7 @@ class ComposedAgent(BaseAlgorithm):
         if task.reward_fn is None and not self.modelled.reward:
             if self.is_fitted or not self._can_model_more:
                 raise self._unknown_reward(env)
-            self.model(reward=True, terminated=self.modelled.terminated)
+            self.new_model(reward=True, terminated=self.modelled.terminated)
         self.n_envs = env.num_envs  # which may be another number than before
         super().set_env(env, force_reset)
         self._task = task

@@ -75,6 +75,8 @@ def read_logged(
                 f"logged {name} must have the shape {[count, *sizes[name]]}, as there are {count} actions and the "
                 f"environment's spaces are {observation_space} and {action_space}, got {list(value.shape)}"
             )
+    if not count:
+        raise EnvironmentDataError("the logged data hold no transitions")
     scaled = in_buffer if scaled_actions is None else scaled_actions
     return rows._replace(action=_unscaled(rows.action, action_space, scaled))
 

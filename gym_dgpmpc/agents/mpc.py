@@ -223,7 +223,7 @@ class MPCAgent(ActingAgent):
             for disagreement in disagreements(self.task, self.store, self.device):
                 self._warn_once(disagreement)
         if self.learns_termination and not self.modelled.terminated and self.store.terminated.any():
-            self.model(reward=self.modelled.reward, terminated=True)
+            self.new_model(reward=self.modelled.reward, terminated=True)
         started = time.perf_counter()
         with nullcontext() if self._safeguard is None else self._safeguard.stop.at_any_time():
             metrics = dict(self.dynamics.fit(self.modelled.transitions(self.store), self.generators.fit))

@@ -193,7 +193,7 @@ def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True,
 def _model_as_saved(agent: Any, modelled: dict[str, bool]) -> None:
     """Make the agent's model anew, to predict what the saved one did."""
     try:
-        agent.model(reward=bool(modelled["reward"]), terminated=bool(modelled["terminated"]))
+        agent.new_model(reward=bool(modelled["reward"]), terminated=bool(modelled["terminated"]))
     except UnknownRewardError as error:
         raise CheckpointError(
             "the file's model predicts the reward or termination too: pass dynamics=... as the function that made it"

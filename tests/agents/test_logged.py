@@ -233,6 +233,13 @@ def test_missing_fields_and_other_kinds_of_data(unchecked):
         agent().add_transitions([1, 2])
 
 
+def test_no_data_at_all():
+    learner = agent()
+    with pytest.raises(EnvironmentDataError, match="no transitions"):
+        learner.add_transitions({name: value[:0] for name, value in played().items()})
+    assert learner.is_exploring
+
+
 def test_actions_of_two_dimensions():
     class Grid(KnownPointMass):
         def __init__(self):

@@ -231,6 +231,15 @@ def test_a_model_that_was_ready_made_cannot_be_given_more_to_predict():
         agent(KnownPointMass(), reward_fn="learned")
 
 
+def test_a_class_makes_models():
+    class Sized(LinearModel):
+        def __init__(self, observation_size, action_size, observation_spec):
+            super().__init__()
+            self.sizes = observation_size, action_size
+
+    assert agent(PointMass(), dynamics=Sized).dynamics.sizes == (3, 1)
+
+
 def test_what_was_asked_to_be_learned_stays_so(tmp_path):
     learner = agent(KnownPointMass(), dynamics=linear, reward_fn="learned").learn(2 * LENGTH)
     learner.save(tmp_path / "agent")
@@ -252,3 +261,13 @@ def test_set_env_learns_a_reward_only_before_the_model_is_trained():
     trained = agent(KnownPointMass(), dynamics=linear).learn(12)
     with pytest.raises(UnknownRewardError, match="Linear"):
         trained.set_env(Linear())
+
+
+@pytest.mark.parametrize(
+    ("env_id", "reward_fn", "sizes"),
+    [("Pendulum-v1", None, (4, 3)), ("Pendulum-v1", "learned", (4, 4)), ("InvertedPendulum-v5", None, (5, 4))],
+)
+def test_gymnasiums_own_tasks_work_at_once(env_id, reward_fn, sizes):
+    learner = DGPMPCAgent(env_id, reward_fn=reward_fn, **{**TINY, "num_layers": 1, "learning_starts": 25}).learn(28)
+    assert (learner.dynamics.encoder.input_size, learner.dynamics.encoder.target_size) == sizes
+    assert learner.modelled.reward == (reward_fn == "learned") and not learner.modelled.terminated
