@@ -39,7 +39,7 @@ def test_results(tmp_path, capsys):
     ]
     assert rows[-1].episode_return == run.recorder.last.rewards.sum()
     assert all(row.seconds > 0 for row in rows)
-    assert capsys.readouterr().out.count("episode") == 3
+    assert capsys.readouterr().out.count("\nepisode ") == 3
     written = run.write_figures("a title")
     assert [path.name for path in written] == ["learning_curve.png", "prediction_fan.png", "last_episode.gif"]
     assert all(path.stat().st_size > 0 for path in written)
@@ -59,8 +59,8 @@ def test_the_saved_agent_has_learned_from_every_episode(tmp_path):
 
 def test_episodes_are_counted_though_they_are_short(tmp_path):
     run = training_run(tmp_path, terminate_at=5)
-    with pytest.warns(UserWarning, match="terminated_fn"):
-        run.train(progress_bar=False)
+    run.train(progress_bar=False)
+    assert run.agent.modelled.terminated
     assert [row.steps for row in run.folder.rows()] == [5, 5, 5]
     assert run.is_complete
     assert DGPMPCAgent.load(run.folder.agent_file).num_fitted == 15
