@@ -276,7 +276,7 @@ def test_runs_as_a_module():
 def test_options_show_the_agents_defaults_and_the_presets():
     arguments = inspect.signature(DGPMPCAgent).parameters
     options_of_the_agent = {name: shown for name, shown in shown_defaults().items() if name in arguments}
-    assert len(options_of_the_agent) == 20
+    assert len(options_of_the_agent) == 21
     del options_of_the_agent["seed"]  # the command line has a default of its own
     assert inspect.signature(cli.train).parameters.keys() >= options_of_the_agent.keys()
     for name, shown in options_of_the_agent.items():

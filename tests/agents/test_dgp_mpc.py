@@ -156,7 +156,7 @@ def test_every_argument_is_documented_and_every_plain_one_saved(agent_class):
     for name in public:
         assert re.search(rf"^        {name}: ", agent_class.__doc__, re.MULTILINE), name
     assert set(public) - set(agent_class.saved_arguments) <= {
-        "env", "dynamics", "planner", "reward_fn", "terminated_fn", "device",
+        "env", "dynamics", "planner", "reward_fn", "terminated_fn", "device", "compile",
     }  # fmt: skip
     assert set(agent_class.saved_arguments) <= set(public)
 
