@@ -2,5 +2,6 @@
 
 from gym_dgpmpc.agents.dgp_mpc import DGPMPCAgent
 from gym_dgpmpc.agents.mpc import MPCAgent
+from gym_dgpmpc.agents.pets import PETSAgent
 
-__all__ = ["DGPMPCAgent", "MPCAgent"]
+__all__ = ["DGPMPCAgent", "MPCAgent", "PETSAgent"]
