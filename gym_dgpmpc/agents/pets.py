@@ -38,6 +38,8 @@ class PETSAgent(MPCAgent):
         draw: how particles move through the networks: "TS1" (each through a network drawn anew at each step), "TSinf"
             (each through one network for the whole plan), "DS" (by the ensemble's mean and total variance), "MM" (as
             DS, then redrawn from a candidate's moments) or "expectation" (along the ensemble's mean).
+        half_precision: compute most of a network in bfloat16 while planning: faster by a multiple on processors with
+            instructions for it, and off by some 0.3 % of a prediction.
         num_particles: P, particles of each candidate; for "TS1" and "TSinf" a multiple of ``num_members``.
         horizon: H, steps that a plan looks ahead.
         num_candidates: K, action sequences tried in each iteration of the planner.
@@ -71,6 +73,7 @@ class PETSAgent(MPCAgent):
         "batch_size",
         "num_epochs",
         "draw",
+        "half_precision",
         "horizon",
         "num_candidates",
         "num_elites",
@@ -90,6 +93,7 @@ class PETSAgent(MPCAgent):
         batch_size: int = 32,
         num_epochs: int = 5,
         draw: Propagation = "TSinf",
+        half_precision: bool = False,
         num_particles: int = 20,
         horizon: int = 25,
         num_candidates: int = 400,
@@ -111,6 +115,7 @@ class PETSAgent(MPCAgent):
         self.weight_decay = tuple(weight_decay)  # an agent's file gives a list
         self._adam_learning_rate = learning_rate
         self.batch_size, self.num_epochs, self.draw = batch_size, num_epochs, draw
+        self.half_precision = half_precision
         self.horizon, self.num_candidates = horizon, num_candidates
         self.num_elites, self.num_iterations = num_elites, num_iterations
         self.observation_spec = observation_spec
@@ -153,6 +158,7 @@ class PETSAgent(MPCAgent):
             batch_size=self.batch_size,
             num_epochs=self.num_epochs,
             draw=self.draw,
+            half_precision=self.half_precision,
             device=self.device,
         )
         super()._setup_model()

@@ -16,7 +16,14 @@ from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.ensemble_draws import PROPAGATIONS, CollapsedEnsemble, EnsembleSampler, Propagation
-from gym_dgpmpc.dynamics.ensemble_network import Ensemble, initial_ensemble, layer_sizes, loss, predict
+from gym_dgpmpc.dynamics.ensemble_network import (
+    Ensemble,
+    half_precision,
+    initial_ensemble,
+    layer_sizes,
+    loss,
+    predict,
+)
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
@@ -53,7 +60,9 @@ class EnsembleDynamics:
         batch_size: transitions per member and gradient.
         num_epochs: passes over the data in one training.
         draw: "TS1", "TSinf", "DS", "MM" or "expectation"; see `ensemble_draws`.
-        dtype: precision of rollouts; networks are trained in float32.
+        half_precision: in rollouts, compute the layers between the first and the last in bfloat16: faster by a
+            multiple on processors with instructions for it, and off by some 0.3 % of a prediction.
+        dtype: precision of all else in rollouts; networks are trained in float32.
         device: where tensors live.
 
     Raises:
@@ -74,6 +83,7 @@ class EnsembleDynamics:
         batch_size: int = 32,
         num_epochs: int = 5,
         draw: Propagation = "TSinf",
+        half_precision: bool = False,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ):
@@ -100,7 +110,7 @@ class EnsembleDynamics:
         self.num_members, self.weight_decay, self.learning_rate = num_members, tuple(weight_decay), learning_rate
         self.batch_size, self.num_epochs, self.draw_kind = batch_size, num_epochs, draw
         self.sizes = layer_sizes(self.encoder.input_size, num_hidden_layers, hidden_size, self.encoder.target_size)
-        self.dtype, self.device = dtype, torch.device(device)
+        self.half_precision, self.dtype, self.device = half_precision, dtype, torch.device(device)
         self._fitted: _Fitted | None = None
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
@@ -150,6 +160,7 @@ class EnsembleDynamics:
         network = Ensemble.from_parameters(
             {name: value.to(self.dtype) for name, value in fitted.network.parameters().items()}
         )
+        network = half_precision(network) if self.half_precision else network
         coordinates = Coordinates(self.encoder, fitted.inputs, _unit(self.encoder.target_size, self.device), self.dtype)
         if self.draw_kind in ("TS1", "TSinf"):
             if num_particles < 1 or num_particles % self.num_members:
