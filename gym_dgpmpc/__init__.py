@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING, Any
 from gym_dgpmpc.envs.registration import register_environments
 
 if TYPE_CHECKING:
-    from gym_dgpmpc.agents import DGPMPCAgent, MPCAgent, PETSAgent
+    from gym_dgpmpc.agents import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent
     from gym_dgpmpc.envs import ModCartPoleEnv, SwingUpCartPoleEnv
 
-__all__ = ["DGPMPCAgent", "MPCAgent", "ModCartPoleEnv", "PETSAgent", "SwingUpCartPoleEnv"]
+__all__ = ["DGPMPCAgent", "GPMPCAgent", "MPCAgent", "ModCartPoleEnv", "PETSAgent", "SwingUpCartPoleEnv"]
 
 # Public name -> the module it is imported from on first use, so that `import gym_dgpmpc` stays light.
 _MODULE_OF = {
     "DGPMPCAgent": "gym_dgpmpc.agents",
+    "GPMPCAgent": "gym_dgpmpc.agents",
     "MPCAgent": "gym_dgpmpc.agents",
     "ModCartPoleEnv": "gym_dgpmpc.envs",
     "PETSAgent": "gym_dgpmpc.agents",
