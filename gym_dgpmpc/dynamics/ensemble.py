@@ -25,6 +25,7 @@ from gym_dgpmpc.dynamics.ensemble_network import (
     predict,
 )
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
+from gym_dgpmpc.dynamics.state import take_tensor
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
 
@@ -168,7 +169,8 @@ class EnsembleDynamics:
                     f"the draw {self.draw_kind} needs a multiple of the ensemble's {self.num_members} members as "
                     f"number of particles, received {num_particles}"
                 )
-            return EnsembleSampler(network, coordinates, generator, shuffle=self.draw_kind == "TS1")
+            shuffle = self.draw_kind == "TS1" and self.num_members > 1
+            return EnsembleSampler(network, coordinates, generator, shuffle=shuffle)
         return GaussianSampler(
             CollapsedEnsemble(network, with_variance=self.draw_kind != "expectation"),
             coordinates,
@@ -197,19 +199,16 @@ class EnsembleDynamics:
             self._fitted = None
             return
 
-        def take(name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> Tensor:
-            value = state.get(name)
-            received = tuple(value.shape) if isinstance(value, Tensor) else value
-            if not isinstance(value, Tensor) or value.shape != shape:
-                raise ValueError(f"dynamics state {name!r}: expected a tensor of shape {shape}, received {received}")
-            return value.to(self.device, dtype).clone()
-
         shapes = self._shapes()
-        network = Ensemble.from_parameters({name: take(name, shape) for name, shape in shapes.items()})
-        size = (self.encoder.input_size,)
-        inputs = Normaliser(*(take(f"inputs.{key}", size, torch.float64) for key in Normaliser._fields))
+        size, device, single = (self.encoder.input_size,), self.device, torch.float32
+        network = Ensemble.from_parameters(
+            {name: take_tensor(state, name, shape, device, single) for name, shape in shapes.items()}
+        )
+        inputs = Normaliser(*(take_tensor(state, f"inputs.{key}", size, device) for key in Normaliser._fields))
         moments = {
-            name: _Moments(*(take(f"adam.{name}.{key}", shape) for key in _Moments._fields))
+            name: _Moments(
+                *(take_tensor(state, f"adam.{name}.{key}", shape, device, single) for key in _Moments._fields)
+            )
             for name, shape in shapes.items()
         }
         num_updates = state.get("adam.num_updates")
