@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.ensemble_draws import PROPAGATIONS, CollapsedEnsemble, EnsembleSampler, Propagation
@@ -25,6 +24,7 @@ from gym_dgpmpc.dynamics.ensemble_network import (
     predict,
 )
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
+from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.state import take_tensor
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
@@ -43,7 +43,7 @@ class _Fitted(NamedTuple):
     num_updates: int  # of Adam, over all trainings
 
 
-class EnsembleDynamics:
+class EnsembleDynamics(Learner[_Fitted]):
     """Implements `DynamicsModel` with an ensemble of B probabilistic networks.
 
     Inputs are standardised at each training, targets are not; the networks and Adam go on from where the last training
@@ -107,12 +107,11 @@ class EnsembleDynamics:
             raise ValueError(f"learning_rate must be positive, received {learning_rate}")
         if draw not in PROPAGATIONS:
             raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(PROPAGATIONS)}")
-        self.encoder = Encoder(observation_size, action_size, observation_spec)
+        super().__init__(observation_size, action_size, observation_spec, dtype, device)
         self.num_members, self.weight_decay, self.learning_rate = num_members, tuple(weight_decay), learning_rate
         self.batch_size, self.num_epochs, self.draw_kind = batch_size, num_epochs, draw
         self.sizes = layer_sizes(self.encoder.input_size, num_hidden_layers, hidden_size, self.encoder.target_size)
-        self.half_precision, self.dtype, self.device = half_precision, dtype, torch.device(device)
-        self._fitted: _Fitted | None = None
+        self.half_precision = half_precision
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """Train every network on N transitions drawn with replacement, for some epochs.
@@ -120,12 +119,9 @@ class EnsembleDynamics:
         Raises:
             ValueError: there are no transitions.
         """
-        observation, action, after = (t.to(self.device, torch.float64) for t in data)
-        if observation.shape[0] == 0:
-            raise ValueError("cannot fit a dynamics model to 0 transitions")
-        raw = self.encoder.inputs(observation, action)
+        raw, targets = self._encode(data)
         inputs = Normaliser.fit(raw)
-        x, y = inputs(raw).float(), self.encoder.targets(observation, after).float()
+        x, y = inputs(raw).float(), targets.float()
         if self._fitted is None:
             network = initial_ensemble(self.num_members, self.sizes, generator, self.device)
             moments, updates = dict[str, _Moments](), 0
@@ -269,11 +265,6 @@ class EnsembleDynamics:
             shapes[f"layers.{i}.weight"] = (self.num_members, inputs, outputs)
             shapes[f"layers.{i}.bias"] = (self.num_members, 1, outputs)
         return shapes | dict.fromkeys(("max_logvar", "min_logvar"), (self.encoder.target_size,))
-
-    def _require_fit(self, verb: str) -> _Fitted:
-        if self._fitted is None:
-            raise RuntimeError(f"cannot {verb}: the dynamics model has not been fitted to any data yet")
-        return self._fitted
 
 
 def _unit(size: int, device: torch.device) -> Normaliser:

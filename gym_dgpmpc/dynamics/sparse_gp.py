@@ -12,11 +12,11 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp_start import NOISE_VARIANCE, restandardise
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
+from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.moment_matching import MomentMatchingSampler
 from gym_dgpmpc.dynamics.state import take_tensor
 from gym_dgpmpc.gp.deep_gp import DeepGP
@@ -40,7 +40,7 @@ class _Fitted(NamedTuple):
     posterior: SparsePosterior
 
 
-class SparseGPDynamics:
+class SparseGPDynamics(Learner[_Fitted]):
     """Implements `DynamicsModel` with one sparse Gaussian process, its kernel shared by the outputs.
 
     Inputs and targets are standardised at each training. Inducing inputs start from training inputs drawn at random,
@@ -92,11 +92,9 @@ class SparseGPDynamics:
         self.kernel: Kernel = check_kernel(kernel)
         if draw == "AMM" and self.kernel != "rbf":
             raise ValueError(f"the draw AMM has closed forms for the kernel 'rbf' only, received {kernel!r}")
-        self.encoder = Encoder(observation_size, action_size, observation_spec)
+        super().__init__(observation_size, action_size, observation_spec, dtype, device)
         self.num_inducing, self.exact, self.max_iterations = num_inducing, exact, max_iterations
         self.draw_kind, self.add_noise, self.update_within_episode = draw, add_noise, update_within_episode
-        self.dtype, self.device = dtype, torch.device(device)
-        self._fitted: _Fitted | None = None
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """Maximise the collapsed bound, then condition on all transitions.
@@ -105,8 +103,6 @@ class SparseGPDynamics:
             ValueError: there are no transitions.
         """
         x, y = self._encode(data)
-        if x.shape[0] == 0:
-            raise ValueError("cannot fit a dynamics model to 0 transitions")
         normalisers = Normaliser.fit(x), Normaliser.fit(y)
         standardised = Data(normalisers[0](x), normalisers[1](y))
         start = self._start(standardised, normalisers, generator)
@@ -205,15 +201,6 @@ class SparseGPDynamics:
     def _condition(self, model: DeepGP, normalisers: tuple[Normaliser, Normaliser], data: Data) -> None:
         posterior = sparse_posterior(self.kernel, model.layers[0], model.noise_variance, *data)
         self._fitted = _Fitted(model, normalisers, posterior)
-
-    def _encode(self, data: Transitions) -> tuple[Tensor, Tensor]:
-        observation, action, after = (t.to(self.device, torch.float64) for t in data)
-        return self.encoder.inputs(observation, action), self.encoder.targets(observation, after)
-
-    def _require_fit(self, verb: str) -> _Fitted:
-        if self._fitted is None:
-            raise RuntimeError(f"cannot {verb}: the dynamics model has not been fitted to any data yet")
-        return self._fitted
 
 
 def _predictor(model: DeepGP, posterior: SparsePosterior) -> Predictor:
