@@ -25,7 +25,12 @@ from gym_dgpmpc.agents.task import offered_by, wrapped_env
 from gym_dgpmpc.errors import CheckpointError, DGPMPCError
 from gym_dgpmpc.types import ObservationSpec, StateDict
 
-AGENT_CLASSES = {"MPCAgent": "gym_dgpmpc.agents.mpc", "DGPMPCAgent": "gym_dgpmpc.agents.dgp_mpc"}
+AGENT_CLASSES = {
+    "MPCAgent": "gym_dgpmpc.agents.mpc",
+    "DGPMPCAgent": "gym_dgpmpc.agents.dgp_mpc",
+    "GPMPCAgent": "gym_dgpmpc.agents.gp_mpc",
+    "PETSAgent": "gym_dgpmpc.agents.pets",
+}
 """The classes that a file may name, and where they are; nothing else is ever imported for a file."""
 
 PACKAGES = ("gym_dgpmpc", "gymnasium", "numpy", "stable_baselines3", "torch")

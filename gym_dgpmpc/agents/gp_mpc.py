@@ -1,0 +1,153 @@
+"""GP-MPC: one sparse Gaussian process for the dynamics, the cross-entropy method for the plan.
+
+The Gaussian-process baselines of Chua et al. (2018) and of Gadd et al. (2020): GP-DS and GP-MM.
+"""
+
+from typing import ClassVar
+
+import torch
+from stable_baselines3.common.type_aliases import GymEnv
+
+from gym_dgpmpc.agents.mpc import MPCAgent
+from gym_dgpmpc.agents.parts import cem_planner
+from gym_dgpmpc.agents.task import find_observation_spec, flat_size
+from gym_dgpmpc.dynamics.sparse_gp import GPDraw, SparseGPDynamics
+from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
+
+
+class GPMPCAgent(MPCAgent):
+    """The comparison's Gaussian process, an `MPCAgent` made of a `SparseGPDynamics` and a `CEM`.
+
+        agent = GPMPCAgent("ModCartPole-v0", **COMPARISON_GP["ModCartPole-v0"], draw="MM", seed=0, verbose=1)
+        agent.learn(total_timesteps=2_000)
+
+    Args:
+        env: the environment, its id, or a VecEnv of one environment; actions a bounded Box, observations a vector.
+        kernel: "rbf", "matern52", "matern32" or "matern12", with one lengthscale per input, shared by the outputs.
+        num_inducing: M, inducing points.
+        exact: make every transition an inducing point: the exact Gaussian process, for small data.
+        max_training_iterations: of the optimiser, at each training.
+        draw: how particles move: "DS" (each by its own draw from the Gaussian at its place), "MM" (as DS, then redrawn
+            from a candidate's moments) or "AMM" (a Gaussian per candidate through its analytic moments; kernel "rbf",
+            and more particles than an observation has numbers).
+        add_noise: draw the observations' noise too, instead of the function alone.
+        update_within_episode: condition on each transition at once, hyperparameters frozen.
+        num_particles: P, particles of each candidate.
+        horizon: H, steps that a plan looks ahead.
+        num_candidates: K, action sequences tried in each iteration of the planner.
+        num_elites: the best of them, that the next iteration starts from; default: a tenth.
+        num_iterations: the most iterations of a plan.
+        actions_per_plan: actions performed of each plan before the next one is made.
+        learning_starts: environment steps of uniform random actions; default: those of one episode.
+        reward_fn: r(s, a, s'), batched over leading dimensions, in torch; default: the environment's ``reward_fn``.
+        terminated_fn: whether an episode ends in s', batched likewise; default: the environment's ``terminated_fn``.
+        observation_spec: how the model reads observations; default: the environment's ``observation_spec``.
+        stats_window_size: episodes that the logged means are over.
+        tensorboard_log: folder for TensorBoard, or None.
+        verbose: 0 for silence, 1 for one line per episode, 2 for SB3's tables of logged values besides.
+        seed: decides everything random: environment, exploration, training and planning. None draws one, kept in
+            ``agent.seed``, and leaves the environment's own seed alone.
+        device: "cpu", "cuda", or "auto" for the second where there is one.
+
+    Raises:
+        ValueError: an argument is out of its range, or the environment is one that cannot be planned for.
+        AssertionError: the action space is not a Box, as from every SB3 algorithm.
+        UnknownRewardError: there is no reward function.
+    """
+
+    saved_arguments: ClassVar[tuple[str, ...]] = (
+        *MPCAgent.saved_arguments,
+        "kernel",
+        "num_inducing",
+        "exact",
+        "max_training_iterations",
+        "draw",
+        "add_noise",
+        "update_within_episode",
+        "horizon",
+        "num_candidates",
+        "num_elites",
+        "num_iterations",
+        "observation_spec",
+    )
+
+    def __init__(
+        self,
+        env: GymEnv | str | None,
+        *,
+        kernel: str = "rbf",
+        num_inducing: int = 200,
+        exact: bool = False,
+        max_training_iterations: int = 200,
+        draw: GPDraw = "DS",
+        add_noise: bool = False,
+        update_within_episode: bool = False,
+        num_particles: int = 5,
+        horizon: int = 30,
+        num_candidates: int = 300,
+        num_elites: int | None = None,
+        num_iterations: int = 5,
+        actions_per_plan: int = 1,
+        learning_starts: int | None = None,
+        reward_fn: RewardFn | None = None,
+        terminated_fn: TerminatedFn | None = None,
+        observation_spec: ObservationSpec | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: torch.device | str = "cpu",
+        _init_setup_model: bool = True,
+    ):
+        self.kernel, self.num_inducing, self.exact = kernel, num_inducing, exact
+        self.max_training_iterations, self.draw = max_training_iterations, draw
+        self.add_noise, self.update_within_episode = add_noise, update_within_episode
+        self.horizon, self.num_candidates = horizon, num_candidates
+        self.num_elites, self.num_iterations = num_elites, num_iterations
+        self.observation_spec = observation_spec
+        super().__init__(
+            env,
+            reward_fn=reward_fn,
+            terminated_fn=terminated_fn,
+            num_particles=num_particles,
+            actions_per_plan=actions_per_plan,
+            learning_starts=learning_starts,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=_init_setup_model,
+        )
+
+    def _setup_model(self) -> None:
+        """Build the parts for the environment's spaces."""
+        self.observation_spec = find_observation_spec(self.env, self.observation_spec)
+        self.planner = cem_planner(
+            self.action_space,
+            self.device,
+            horizon=self.horizon,
+            num_candidates=self.num_candidates,
+            num_elites=self.num_elites,
+            num_iterations=self.num_iterations,
+        )
+        size = flat_size(self.observation_space)
+        if self.draw == "AMM" and self.num_particles <= size:
+            raise ValueError(
+                f"the draw AMM needs more particles than the {size} numbers of an observation, got num_particles = "
+                f"{self.num_particles}"
+            )
+        self.dynamics = SparseGPDynamics(
+            size,
+            flat_size(self.action_space),
+            self.observation_spec,
+            kernel=self.kernel,
+            num_inducing=self.num_inducing,
+            exact=self.exact,
+            max_iterations=self.max_training_iterations,
+            draw=self.draw,
+            add_noise=self.add_noise,
+            update_within_episode=self.update_within_episode,
+            device=self.device,
+        )
+        super()._setup_model()
