@@ -12,12 +12,13 @@ INSTALLED := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint clean
+.PHONY: help install demo test fault-test lint clean
 
 help:
 	@echo "make install   set up .venv with the package and everything its development needs"
 	@echo "make demo      train on ModCartPole-v0 for a few minutes; results in demo/"
 	@echo "make test      lint, then the tests (PYTEST_ARGS=... for pytest)"
+	@echo "make fault-test  kill, cut, mutate and soak in full, for more than half an hour; table in benchmarks/results/"
 	@echo "make lint      ruff and mypy"
 	@echo "make clean     remove .venv, caches and demo/"
 	@echo "PYTHON=python3.12 make ... chooses the interpreter that .venv is made with (default: python3)"
@@ -52,6 +53,10 @@ test: lint
 	@gl=$${MUJOCO_GL:-$$($(BIN)/python -m gym_dgpmpc.reporting.rendering)}; \
 	echo "MUJOCO_GL=$$gl"; \
 	MUJOCO_GL=$$gl $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
+
+# The full form of tests/faults, two sections at a time; `make test` runs a short form.
+fault-test: $(INSTALLED)
+	$(BIN)/python -m tests.faults
 
 clean:
 	rm -rf $(VENV) demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,7 +1,7 @@
 """The command line: `dgpmpc train ENV_ID` and `dgpmpc evaluate PATH`.
 
-Says what is wrong in one line, with exit code 2. What is slow to import is imported when a command runs, so that
-`--help` answers at once.
+Says what is wrong in one line, with exit code 2; stops with 130 after Ctrl-C and with 143 after SIGTERM. What is slow
+to import is imported when a command runs, so that `--help` answers at once.
 """
 
 import importlib.metadata
@@ -25,7 +25,7 @@ from gym_dgpmpc.errors import DGPMPCError
 if TYPE_CHECKING:
     from gym_dgpmpc.reporting.run import TrainingRun
 
-EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
+EXIT_ERROR, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 130, 143
 DEFAULT_EPISODES = 15
 RUN = "Run"
 
@@ -56,7 +56,7 @@ def train(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the results. A run that it holds goes on after its last finished episode.",
+            help="Folder for the results. A run that it holds goes on where it was interrupted.",
             show_default="runs/ENV_ID-seedSEED",
             rich_help_panel=RUN,
         ),
@@ -95,6 +95,12 @@ def train(
     video: Annotated[
         bool, typer.Option("--video/--no-video", help="A GIF of the last episode; needs OpenGL.", rich_help_panel=RUN)
     ] = True,
+    checkpoint_every: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Steps between checkpoints within an episode, beside those at its end.", rich_help_panel=RUN
+        ),
+    ] = None,
     num_layers: options.NumLayers = None,
     kernel: options.Kernel = None,
     num_inducing: options.NumInducing = None,
@@ -107,6 +113,7 @@ def train(
     num_elites: options.NumElites = None,
     num_iterations: options.NumIterations = None,
     actions_per_plan: options.ActionsPerPlan = None,
+    time_budget: options.TimeBudget = None,
     learning_starts: options.LearningStarts = None,
     first_training_iterations: options.FirstTraining = None,
     training_iterations: options.Training = None,
@@ -131,6 +138,7 @@ def train(
         num_elites=num_elites,
         num_iterations=num_iterations,
         actions_per_plan=actions_per_plan,
+        time_budget=time_budget,
         learning_starts=learning_starts,
         first_training_iterations=first_training_iterations,
         training_iterations=training_iterations,
@@ -145,7 +153,7 @@ def train(
         _use_threads(threads)
         no_video = _prepare_video(env_id) if video else "--no-video was given"
         env = _make(env_id, render=not no_video)
-        run = _set_up_run(env, asked, out, overwrite, episodes, timesteps)
+        run = _set_up_run(env, asked, out, overwrite, episodes, timesteps, checkpoint_every)
     if run.is_complete:
         typer.echo(f"{run.folder.path} holds this run already, finished: ask for more --episodes, or --overwrite it")
         return
@@ -155,10 +163,12 @@ def train(
     try:
         with _one_line_errors():
             run.train(progress_bar=os.isatty(1) if progress is None else progress)
-    except KeyboardInterrupt:
-        typer.echo(f"\ninterrupted; the same command goes on after the last finished episode in {run.folder.path}")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-    _summarise(run, env_id, time.perf_counter() - started)
+    except (KeyboardInterrupt, SystemExit) as stop:
+        typer.echo(f"\ninterrupted; the same command goes on from the checkpoint in {run.folder.path}")
+        raise typer.Exit(EXIT_TERMINATED if isinstance(stop, SystemExit) else EXIT_INTERRUPTED) from None
+    finally:
+        run.folder.close()
+    _summarise(run, time.perf_counter() - started)
     if video and no_video:
         typer.echo(f"no GIF: {no_video}")
     typer.echo(
@@ -191,9 +201,9 @@ def evaluate(
 
     from gym_dgpmpc.agents import MPCAgent
     from gym_dgpmpc.agents.checkpoint import read_checkpoint
+    from gym_dgpmpc.agents.run_checkpoints import NEWEST
     from gym_dgpmpc.reporting.recording import Episode, EpisodeRecorder
     from gym_dgpmpc.reporting.rendering import write_gif
-    from gym_dgpmpc.reporting.run import AGENT_FILE
 
     returns: list[float] = []
 
@@ -203,7 +213,7 @@ def evaluate(
 
     with _one_line_errors(ValueError, AssertionError, OSError):
         _use_threads(threads)
-        file = path / AGENT_FILE if path.is_dir() else path
+        file = path / NEWEST if path.is_dir() else path
         env_id = env_id or read_checkpoint(file).config.get("environment")
         if env_id is None:
             raise ValueError(f"{file} does not say which environment it was trained in: give --env ENV_ID")
@@ -276,6 +286,7 @@ def _set_up_run(
     overwrite: bool,
     episodes: int | None,
     timesteps: int | None,
+    checkpoint_every: int | None,
 ) -> "TrainingRun":
     """The run that the options describe, with what they leave open filled in."""
     from gym_dgpmpc.reporting.run import RunFolder, TrainingRun
@@ -293,8 +304,20 @@ def _set_up_run(
         {"environment": env_id, **arguments},
         overwrite=overwrite,
     )
-    run = TrainingRun(folder, env, arguments, num_episodes=episodes, total_timesteps=timesteps)
-    folder.write_settings(episodes=episodes, timesteps=timesteps)
+    try:
+        run = TrainingRun(
+            folder,
+            env,
+            arguments,
+            num_episodes=episodes,
+            total_timesteps=timesteps,
+            checkpoint_every=checkpoint_every,
+            title=f"{env_id}, L = {arguments['num_layers']}, {arguments['kernel']}, seed {arguments['seed']}",
+        )
+        folder.write_settings(episodes=episodes, timesteps=timesteps)
+    except BaseException:
+        folder.close()
+        raise
     return run
 
 
@@ -311,10 +334,9 @@ def _fill_in(env_id: str, asked: dict[str, Any]) -> dict[str, Any]:
     return filled | {name: value for name, value in asked.items() if value is not None}
 
 
-def _summarise(run: "TrainingRun", env_id: str, seconds: float) -> None:
-    """Draw the figures, and say how it went and where everything is."""
+def _summarise(run: "TrainingRun", seconds: float) -> None:
+    """Say how it went and where everything is."""
     agent, folder = run.agent, run.folder
-    figures = run.write_figures(f"{env_id}, L = {agent.num_layers}, {agent.kernel}, seed {agent.seed}")
     planned = [row.episode_return for row in folder.rows() if row.actions == "planned"]
     typer.echo(f"\n{agent.num_timesteps} environment steps; this command took {seconds / 60:.1f} minutes")
     if planned:
@@ -322,5 +344,5 @@ def _summarise(run: "TrainingRun", env_id: str, seconds: float) -> None:
         typer.echo(
             f"return of {len(planned)} planned episodes: mean {mean:.2f}, best {best:.2f}, last {planned[-1]:.2f}"
         )
-    for file in [*figures, folder.agent_file, folder.episodes_file]:
+    for file in [*run.figures, folder.agent_file, folder.episodes_file]:
         typer.echo(f"  {file}")

@@ -73,6 +73,16 @@ ActionsPerPlan = Annotated[
     int | None, _planner("--actions-per-plan", "Actions performed of each plan.", "1, or the paper's for ENV_ID")
 ]
 
+TimeBudget = Annotated[
+    float | None,
+    typer.Option(
+        "--time-budget",
+        help="Seconds that a plan may take; the best one found by then is used. Runs do not repeat exactly with it.",
+        show_default="as long as it takes",
+        rich_help_panel="Planner",
+    ),
+]
+
 LearningStarts = Annotated[
     int | None, _training("--random-steps", "Environment steps of random actions at first.", "those of one episode")
 ]

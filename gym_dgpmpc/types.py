@@ -123,7 +123,7 @@ class Plan(NamedTuple):
 
 
 class PlanInfo(NamedTuple):
-    """What a plan found. ``expected_return`` is the mean score of the elites of the last iteration."""
+    """What a plan found. ``expected_return`` is the mean score of the elites of the last iteration; NaN without one."""
 
     expected_return: float
     num_nonfinite: int
@@ -136,8 +136,14 @@ class Planner(Protocol):
 
     def initial_plan(self) -> Plan: ...
 
-    def plan(self, objective: Objective, plan: Plan, generator: torch.Generator) -> tuple[Plan, PlanInfo]:
-        """Optimise from ``plan``; the result's mean lies within the action bounds."""
+    def plan(
+        self, objective: Objective, plan: Plan, generator: torch.Generator, deadline: float | None = None
+    ) -> tuple[Plan, PlanInfo]:
+        """Optimise from ``plan``; the result's mean lies within the action bounds.
+
+        Args:
+            deadline: a time of `time.perf_counter` by which to return the best plan so far, or None.
+        """
         ...
 
     def shift(self, plan: Plan, num_actions: int) -> Plan:

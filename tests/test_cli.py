@@ -4,7 +4,9 @@ import csv
 import importlib.metadata
 import inspect
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
 import typing
@@ -15,6 +17,7 @@ from typer.testing import CliRunner
 from gym_dgpmpc import cli, options
 from gym_dgpmpc.agents import DGPMPCAgent
 from gym_dgpmpc.agents.presets import PAPER
+from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
 from gym_dgpmpc.dynamics.deep_gp_draws import DRAWS, REFRESHES
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.reporting import rendering
@@ -60,6 +63,8 @@ def test_train_and_evaluate(run, tmp_path, drawable):
     assert "return of 2 planned episodes: mean" in result.stdout
     assert "next: dgpmpc evaluate a" in result.stdout
     assert {path.name for path in (tmp_path / "a").iterdir()} == {
+        ".lock",
+        "agent.previous.zip",
         "agent.zip",
         "episodes.csv",
         "last_episode.gif",
@@ -133,6 +138,47 @@ def test_interruption(run, monkeypatch):
     assert "the same command goes on" in result.stdout
 
 
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_end_a_run_with_their_exit_codes(run, tmp_path, monkeypatch, number, code):
+    command = ("train", ENV_ID, *SMALLEST, "--no-video", "--out", "a", "--episodes", 3, "--checkpoint-every", 5)
+    step = ToyPush.step
+
+    def step_with_signal(self, action):
+        if self.time == 3 and (tmp_path / "a" / "agent.previous.zip").exists():  # after an episode
+            os.kill(os.getpid(), number)
+        return step(self, action)
+
+    monkeypatch.setattr(ToyPush, "step", step_with_signal)
+    result = run(*command)
+    assert result.exit_code == code, result.output
+    assert "the same command goes on from the checkpoint in a" in result.stdout
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    result = run(*command)
+    assert result.exit_code == 0, result.output
+    assert "goes on after step 12" in result.stdout
+    assert "return of 3 planned episodes" in result.stdout
+
+
+def test_a_folder_in_use_and_a_failing_environment_are_one_line(run, tmp_path, monkeypatch):
+    command = ("train", ENV_ID, *SMALLEST, "--no-video", "--out", "a", "--episodes", 2)
+    with RunCheckpoints(tmp_path / "a"):
+        assert is_one_line_error(run(*command), "in use by process")
+    step = ToyPush.step
+
+    def failing(self, action):
+        if self.time == 5 and (tmp_path / "a" / "agent.previous.zip").exists():  # after an episode
+            raise ConnectionError("the plant is gone")
+        return step(self, action)
+
+    monkeypatch.setattr(ToyPush, "step", failing)
+    assert is_one_line_error(run(*command), "step 17: the environment's step raised ConnectionError: the plant is gone")
+    monkeypatch.setattr(ToyPush, "step", step)
+    result = run(*command)
+    assert result.exit_code == 0, result.output
+    assert "goes on after step 17" in result.stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "texts"),
     [
@@ -148,7 +194,7 @@ def test_interruption(run, monkeypatch):
 )
 def test_train_says_what_is_wrong(run, tmp_path, arguments, texts):
     assert is_one_line_error(run("train", *arguments, "--no-video"), *texts)
-    assert not list(tmp_path.rglob("*.*"))
+    assert [path for path in tmp_path.rglob("*.*") if path.name != ".lock"] == []
 
 
 def test_an_error_without_words_says_where_it_was(run, monkeypatch):
@@ -200,7 +246,7 @@ def test_runs_as_a_module():
 def test_options_show_the_agents_defaults_and_the_presets():
     arguments = inspect.signature(DGPMPCAgent).parameters
     options_of_the_agent = {name: shown for name, shown in shown_defaults().items() if name in arguments}
-    assert len(options_of_the_agent) == 19
+    assert len(options_of_the_agent) == 20
     del options_of_the_agent["seed"]  # the command line has a default of its own
     assert inspect.signature(cli.train).parameters.keys() >= options_of_the_agent.keys()
     for name, shown in options_of_the_agent.items():

@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_system_info, safe_mean
 
 from gym_dgpmpc.agents.checkpoint import CheckpointPath, write_checkpoint
-from gym_dgpmpc.agents.plan_state import PolicyState, pack, unpack
+from gym_dgpmpc.agents.plan_state import PlanState, PolicyState, pack, unpack
 from gym_dgpmpc.agents.policy import PlanningPolicy
 from gym_dgpmpc.agents.randomness import fresh_seed, observation_generator, split_seed
 from gym_dgpmpc.agents.saving import collect, load_agent
@@ -43,6 +43,7 @@ class PlanningAgent(BaseAlgorithm):
         "num_particles",
         "actions_per_plan",
         "learning_starts",
+        "time_budget",
         "stats_window_size",
         "tensorboard_log",
         "verbose",
@@ -61,6 +62,7 @@ class PlanningAgent(BaseAlgorithm):
         num_particles: int = 5,
         actions_per_plan: int = 1,
         learning_starts: int | None = None,
+        time_budget: float | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         verbose: int = 0,
@@ -88,7 +90,7 @@ class PlanningAgent(BaseAlgorithm):
         if planner is not None:
             self.planner = planner
         self.num_particles, self.actions_per_plan = num_particles, actions_per_plan
-        self.learning_starts = learning_starts
+        self.learning_starts, self.time_budget = learning_starts, time_budget
         self.given_reward_fn, self.given_terminated_fn = reward_fn, terminated_fn
         self.seeds_environment = seed is not None
         self.seed = fresh_seed() if seed is None else seed
@@ -107,7 +109,13 @@ class PlanningAgent(BaseAlgorithm):
         if self.env is not None or self.given_reward_fn is not None:
             self._task = self._find_task()
         self.planning = PlanningPolicy(
-            self.dynamics, self.planner, self.action_space, self.num_particles, self.actions_per_plan, self.device
+            self.dynamics,
+            self.planner,
+            self.action_space,
+            self.num_particles,
+            self.actions_per_plan,
+            self.device,
+            self.time_budget,
         )
         self.num_fitted = 0  # transitions that the last training saw
         self._warned: set[str] = set()
@@ -116,6 +124,11 @@ class PlanningAgent(BaseAlgorithm):
     def is_fitted(self) -> bool:
         """Whether the dynamics model has been trained."""
         return self.num_fitted > 0
+
+    @property
+    def num_late_plans(self) -> int:
+        """Plans that took longer than ``time_budget``, of `learn` and `predict` together, since the agent was made."""
+        return self.planning.num_late
 
     @property
     def task(self) -> Task:
@@ -137,7 +150,9 @@ class PlanningAgent(BaseAlgorithm):
     ) -> tuple[np.ndarray, PolicyState]:
         """Plan, and return the action and the plan to pass to the next call.
 
-        Leaves learning untouched: nothing that training draws from or trains is moved.
+        Leaves learning untouched: nothing that training draws from or trains is moved. With a ``time_budget`` the plan
+        is the best that was found in that time; a plan that took longer all the same is counted in `num_late_plans`,
+        and the first one warns.
 
         Args:
             observation: [S], or [n, S] of n environments.
@@ -171,13 +186,22 @@ class PlanningAgent(BaseAlgorithm):
                 generator = observation_generator(self.seed, row, self.device)
             before = cold if starts[i] else states[i]
             if self.is_fitted:
-                action, states[i], _ = self.planning.plan(self.task, row, before, generator)
+                action, states[i] = self._planned(row, before, generator)
             else:
                 self._warn_once("predict was called before the agent has learned: there is no model to plan with")
                 action = self.planning.midpoint() if deterministic else self.planning.uniform(generator)
                 states[i] = cold
             actions.append(action.reshape(self.action_space.shape).astype(self.action_space.dtype))
         return np.stack(actions) if is_batch else actions[0], pack(states)
+
+    def _planned(
+        self, observation: np.ndarray, before: PlanState, generator: torch.Generator
+    ) -> tuple[np.ndarray, PlanState]:
+        late = self.planning.num_late
+        action, after, _ = self.planning.plan(self.task, observation, before, generator)
+        if self.planning.num_late > late:
+            self._warn_once(f"a plan took longer than the time_budget of {self.time_budget} s: see num_late_plans")
+        return action, after
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Go on in another environment of the same spaces; its reward is planned with, unless one was given.
@@ -226,7 +250,7 @@ class PlanningAgent(BaseAlgorithm):
             exclude, include: of SB3's signature; without effect.
 
         Raises:
-            OSError: the file cannot be written.
+            CheckpointWriteError: the file cannot be written; the old one is whole. It is an OSError too.
         """
         write_checkpoint(collect(self), path)
 
@@ -234,7 +258,7 @@ class PlanningAgent(BaseAlgorithm):
     def load(
         cls: type[SelfAgent],
         path: CheckpointPath,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         device: torch.device | str = "cpu",
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
@@ -245,7 +269,7 @@ class PlanningAgent(BaseAlgorithm):
 
         Args:
             path: what `save` was given.
-            env: the environment to go on in; None serves prediction, and then a reward function must be given.
+            env: the environment to go on in, or its id; None serves prediction, and then the reward must be given.
             device: where planning computes.
             custom_objects: of SB3's signature; without effect, since nothing is unpickled.
             print_system_info: print versions of this system.

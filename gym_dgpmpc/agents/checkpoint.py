@@ -4,51 +4,58 @@
     config.json            plain values
     NAME.safetensors       the tensors of one part
 
-Nothing is unpickled, ever. Members are stored uncompressed, so no file can claim more memory than its own size.
+Nothing is unpickled, ever, and no size in a file is believed (`reading.py`).
 """
 
 import hashlib
 import io
 import json
 import os
-import secrets
+import re
 import zipfile
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from gym_dgpmpc.errors import CheckpointError
+from gym_dgpmpc.agents.files import replace_file
+from gym_dgpmpc.agents.reading import UnsafeFileError, open_members, parse_json, parse_tensors
+from gym_dgpmpc.errors import CheckpointError, CheckpointWriteError
 
 FORMAT = "gym_dgpmpc agent"
-SCHEMA = 1
-MAX_FILE_BYTES = 4 << 30
-MAX_JSON_BYTES = 16 << 20
-MAX_MEMBERS = 64
+SCHEMA = 2
+"""1: without what a running episode needs to go on, and without the arguments added since (see `saving.py`)."""
 
 CheckpointPath = str | os.PathLike[str] | IO[bytes] | io.BufferedIOBase
 
 
 class Checkpoint(NamedTuple):
-    """What a file holds: plain values, and the tensors of each part by name."""
+    """What a file holds: plain values, and the tensors of each part by name; and the schema it had, if it was read."""
 
     config: dict[str, Any]
     tensors: dict[str, dict[str, Tensor]]
+    schema: int = SCHEMA
 
 
-def write_checkpoint(checkpoint: Checkpoint, path: CheckpointPath) -> None:
+def checkpoint_path(path: str | os.PathLike[str]) -> Path:
+    """Where a checkpoint of this name is written: ".zip" is added to what has no suffix."""
+    target = Path(path)
+    return target.with_name(f"{target.name}.zip") if target.suffix == "" else target
+
+
+def write_checkpoint(checkpoint: Checkpoint, path: CheckpointPath, previous: Path | None = None) -> None:
     """Write to a file, replacing an old one only when the new one is complete and on disk.
 
     Args:
         checkpoint: its config must be JSON-serialisable.
-        path: ".zip" is added to a path without a suffix, and missing folders are made. A binary file object is
-            written to as it is, without those guarantees.
+        path: see `checkpoint_path`; missing folders are made. A binary file object is written to as it is, without
+            those guarantees.
+        previous: keep the old file under this name.
 
     Raises:
-        OSError: the file cannot be written; an old one is untouched.
+        CheckpointWriteError: the file cannot be written; an old one is untouched. It is an OSError too.
     """
     members = {"config.json": _to_json(checkpoint.config)}
     for name, tensors in checkpoint.tensors.items():
@@ -60,21 +67,12 @@ def write_checkpoint(checkpoint: Checkpoint, path: CheckpointPath) -> None:
     if not isinstance(path, str | os.PathLike):
         _write_zip(members, path)
         return
-    target = Path(path)
-    if target.suffix == "":
-        target = target.with_name(f"{target.name}.zip")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    target = checkpoint_path(path)
     try:
-        with open(temporary, "xb") as file:
-            _write_zip(members, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    _sync_folder(target.parent)
+        replace_file(target, lambda file: _write_zip(members, file), previous)
+    except OSError as error:
+        kept = "; the one before it is whole" if target.exists() else ""
+        raise CheckpointWriteError(error.errno, f"could not write {target}: {error.strerror or error}{kept}") from error
 
 
 def read_checkpoint(path: CheckpointPath) -> Checkpoint:
@@ -91,62 +89,61 @@ def read_checkpoint(path: CheckpointPath) -> Checkpoint:
         source = source.with_name(f"{source.name}.zip")
     if source.is_dir():
         raise CheckpointError(f"{source} is a folder, not a checkpoint file")
+    if source.exists() and not source.is_file():
+        raise CheckpointError(f"{source} is not a regular file")
     with open(source, "rb") as file:
         return _read(file, str(source))
 
 
 def _read(file: IO[bytes] | io.BufferedIOBase, where: str) -> Checkpoint:
-    size = file.seek(0, io.SEEK_END)
-    file.seek(0)
-    if size > MAX_FILE_BYTES:
-        raise CheckpointError(f"{where} has {size} bytes, more than a checkpoint may have ({MAX_FILE_BYTES})")
     try:
-        with zipfile.ZipFile(file) as archive:
-            return _read_archive(archive, size, where)
-    except CheckpointError:
-        raise
-    # What zipfile and json raise for damaged or hostile bytes is not limited to their own errors.
+        members = open_members(file)
+    # What zipfile raises for damaged or hostile bytes is not limited to its own errors.
     except Exception as error:
         raise CheckpointError(f"{where} is not a checkpoint of this package, or is damaged: {error}") from error
-
-
-def _read_archive(archive: zipfile.ZipFile, size: int, where: str) -> Checkpoint:
-    entries = {entry.filename: entry for entry in archive.infolist()}
-    if "manifest.json" not in entries:
+    if "manifest.json" not in members:
         raise CheckpointError(f"{where} is not a checkpoint of this package: it has no manifest.json")
-    if len(entries) != len(archive.infolist()) or len(entries) > MAX_MEMBERS:
-        raise CheckpointError(f"{where} is damaged: it has repeated or too many members")
-    for name, entry in entries.items():
-        limit = MAX_JSON_BYTES if name.endswith(".json") else size
-        if entry.compress_type != zipfile.ZIP_STORED or entry.file_size > limit:
-            raise CheckpointError(f"{where}: the member {name!r} is compressed or larger than it may be")
-
-    manifest = _from_json(archive.read("manifest.json"), "manifest.json", where)
+    manifest = _json(members.pop("manifest.json"), "manifest.json", where)
     if manifest.get("format") != FORMAT:
         raise CheckpointError(f"{where} is not a checkpoint of this package: its format is {manifest.get('format')!r}")
-    if not isinstance(manifest.get("schema"), int) or manifest["schema"] > SCHEMA:
+    schema = manifest.get("schema")
+    if not isinstance(schema, int) or isinstance(schema, bool) or not 1 <= schema <= SCHEMA:
         raise CheckpointError(
-            f"{where} has schema {manifest.get('schema')!r}; this version of gym_dgpmpc reads up to {SCHEMA}. "
+            f"{where} has schema {schema!r}; this version of gym_dgpmpc reads up to {SCHEMA}. "
             "Load it with the version that wrote it, or a newer one"
         )
     table = manifest.get("members")
-    if not isinstance(table, dict) or set(table) != set(entries) - {"manifest.json"} or "config.json" not in table:
+    if not isinstance(table, dict) or set(table) != set(members) or "config.json" not in table:
         raise CheckpointError(f"{where} is damaged: its members are not those of its manifest")
-
-    members = {name: archive.read(name) for name in table}
     for name, data in members.items():
         if table[name] != {"bytes": len(data), "sha256": _sha256(data)}:
             raise CheckpointError(f"{where} is damaged: the checksum of {name!r} does not match")
-    config = _from_json(members.pop("config.json"), "config.json", where)
-    tensors = {}
-    for name, data in members.items():
-        if not name.endswith(".safetensors"):
-            raise CheckpointError(f"{where} holds an unknown member {name!r}")
-        try:
-            tensors[name.removesuffix(".safetensors")] = load_tensors(data)
-        except SafetensorError as error:
-            raise CheckpointError(f"{where}: the tensors of {name!r} cannot be read: {error}") from error
-    return Checkpoint(config, tensors)
+    config = _json(members.pop("config.json"), "config.json", where)
+    return Checkpoint(
+        config, {_part(name, where): _tensors(data, name, where) for name, data in members.items()}, schema
+    )
+
+
+def _part(name: str, where: str) -> str:
+    if not re.fullmatch(r"[a-z_]+\.safetensors", name):
+        raise CheckpointError(f"{where} holds an unknown member {name!r}")
+    return name.removesuffix(".safetensors")
+
+
+def _tensors(data: bytes, name: str, where: str) -> dict[str, Tensor]:
+    try:
+        return parse_tensors(data)
+    except (SafetensorError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{where}: the tensors of {name!r} cannot be read: {error}") from error
+
+
+def _json(data: bytes, name: str, where: str) -> dict[str, Any]:
+    try:
+        return parse_json(data)
+    except UnsafeFileError as error:
+        raise CheckpointError(f"{where} is damaged: {name}: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise CheckpointError(f"{where} is damaged: {name} cannot be read: {error}") from error
 
 
 def _write_zip(members: dict[str, bytes], file: IO[bytes] | io.BufferedIOBase) -> None:
@@ -157,29 +154,8 @@ def _write_zip(members: dict[str, bytes], file: IO[bytes] | io.BufferedIOBase) -
 
 
 def _to_json(value: dict[str, Any]) -> bytes:
-    return json.dumps(value, indent=1).encode()
-
-
-def _from_json(data: bytes, name: str, where: str) -> dict[str, Any]:
-    value = json.loads(data)
-    if not isinstance(value, dict):
-        raise CheckpointError(f"{where}: {name} holds a {type(value).__name__}, not an object")
-    return value
+    return json.dumps(value, indent=1, allow_nan=False).encode()
 
 
 def _sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the renaming itself durable, where the system lets a folder be opened."""
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(descriptor)
-    except OSError:
-        pass
-    finally:
-        os.close(descriptor)

@@ -52,6 +52,7 @@ class DGPMPCAgent(MPCAgent):
         learning_starts: environment steps of uniform random actions; default: those of one episode.
         compile: roll plans out in compiled code, which a C++ compiler builds once in a few seconds; without one, or on
             another device than the CPU, PyTorch does it, several times slower. Not saved with the agent.
+        time_budget: seconds that a plan may take, or None; see `MPCAgent`.
         reward_fn: r(s, a, s'), batched over leading dimensions, in torch; default: the environment's ``reward_fn``.
         terminated_fn: whether an episode ends in s', batched likewise; default: the environment's ``terminated_fn``.
         observation_spec: how the model reads observations; default: the environment's ``observation_spec``.
@@ -117,6 +118,7 @@ class DGPMPCAgent(MPCAgent):
         actions_per_plan: int = 1,
         learning_starts: int | None = None,
         compile: bool = True,
+        time_budget: float | None = None,
         reward_fn: RewardFn | None = None,
         terminated_fn: TerminatedFn | None = None,
         observation_spec: ObservationSpec | None = None,
@@ -142,6 +144,7 @@ class DGPMPCAgent(MPCAgent):
             num_particles=num_particles,
             actions_per_plan=actions_per_plan,
             learning_starts=learning_starts,
+            time_budget=time_budget,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,

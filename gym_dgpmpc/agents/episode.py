@@ -3,6 +3,8 @@
 import time
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from gym_dgpmpc.types import PlanInfo
 
@@ -22,12 +24,15 @@ class EpisodeRecord:
         self.plans: list[PlanInfo] = []
         self.plan_steps: list[int] = []
         self.plan_seconds: list[float] = []
+        self.num_late = 0
+        """Plans that took longer than their time budget."""
 
-    def add_plan(self, info: PlanInfo, seconds: float) -> None:
+    def add_plan(self, info: PlanInfo, seconds: float, *, late: bool = False) -> None:
         """A plan made before the step whose reward is added next."""
         self.plans.append(info)
         self.plan_steps.append(len(self.rewards))
         self.plan_seconds.append(seconds)
+        self.num_late += late
 
     def add_reward(self, reward: float) -> None:
         self.rewards.append(reward)
@@ -45,7 +50,10 @@ class EpisodeRecord:
         """
         predicted = [info.expected_return / self.horizon for info in self.plans]
         obtained = [np.mean(self.rewards[step : step + self.horizon]) for step in self.plan_steps]
-        return float(np.mean(predicted)), float(np.mean(obtained))
+        known = np.isfinite(predicted)  # a plan without time for one iteration expected nothing
+        if not known.any():
+            return float("nan"), float("nan")
+        return float(np.mean(np.array(predicted)[known])), float(np.mean(np.array(obtained)[known]))
 
     def metrics(self) -> dict[str, float]:
         """Names and values for the logger; those of planning only if there were plans."""
@@ -53,10 +61,11 @@ class EpisodeRecord:
         metrics["time/ep_seconds"] = time.perf_counter() - self.started
         if self.plans:
             predicted, obtained = self.predicted_and_obtained()
-            metrics["planner/expected_return"] = float(np.mean([info.expected_return for info in self.plans]))
+            metrics["planner/expected_return"] = self.horizon * predicted
             metrics["planner/predicted_reward_per_step"] = predicted
             metrics["planner/obtained_reward_per_step"] = obtained
             metrics["planner/num_nonfinite"] = sum(info.num_nonfinite for info in self.plans)
+            metrics["planner/num_late"] = self.num_late
             metrics["planner/num_iterations"] = float(np.mean([info.num_iterations for info in self.plans]))
             metrics["time/plan_ms"] = 1e3 * float(np.mean(self.plan_seconds))
             metrics["time/plan_ms_p95"] = 1e3 * float(np.quantile(self.plan_seconds, 0.95))
@@ -73,4 +82,34 @@ class EpisodeRecord:
         plan_ms = 1e3 * float(np.mean(self.plan_seconds))
         text += f" | per step: predicted {predicted:8.3f}, obtained {obtained:8.3f} | {plan_ms:5.0f} ms per plan"
         num_nonfinite = sum(info.num_nonfinite for info in self.plans)
-        return f"{text} | {num_nonfinite} candidates not finite" if num_nonfinite else text
+        if num_nonfinite:
+            text += f" | {num_nonfinite} candidates not finite"
+        return f"{text} | {self.num_late} of {len(self.plans)} plans late" if self.num_late else text
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything but the number, which is counted elsewhere."""
+        return {
+            "rewards": torch.tensor(self.rewards, dtype=torch.float64),
+            "plans": torch.tensor(self.plans, dtype=torch.float64).reshape(-1, len(PlanInfo._fields)),
+            "plan_steps": torch.tensor(self.plan_steps, dtype=torch.int64),
+            "plan_seconds": torch.tensor(self.plan_seconds, dtype=torch.float64),
+            "num_late": torch.tensor(self.num_late),
+            "seconds": torch.tensor(time.perf_counter() - self.started, dtype=torch.float64),
+        }
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from `state_dict`.
+
+        Raises:
+            KeyError, TypeError, ValueError: the state is not one.
+        """
+        plans = state["plans"].tolist()
+        counts = {len(plans), *state["plan_steps"].shape, *state["plan_seconds"].shape}
+        if len(counts) != 1 or state["rewards"].ndim != 1:
+            raise ValueError(f"an episode's record has plans of different counts: {counts}")
+        self.rewards = state["rewards"].tolist()
+        self.plans = [PlanInfo(value, int(nonfinite), int(iterations)) for value, nonfinite, iterations in plans]
+        self.plan_steps = [int(step) for step in state["plan_steps"].tolist()]
+        self.plan_seconds = state["plan_seconds"].tolist()
+        self.num_late = int(state["num_late"])
+        self.started = time.perf_counter() - float(state["seconds"])

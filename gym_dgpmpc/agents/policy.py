@@ -3,6 +3,9 @@
 Knows nothing of learning or of the environment; the agent asks it both while it learns and when it predicts.
 """
 
+import math
+import time
+
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -24,6 +27,7 @@ class PlanningPolicy:
         num_particles: P, worlds per plan.
         actions_per_plan: actions performed of each plan before the next one is made.
         device: where dynamics and planner compute.
+        time_budget: seconds that a plan may take, or None; see `plan`.
 
     Raises:
         ValueError: a number is out of its range.
@@ -37,7 +41,13 @@ class PlanningPolicy:
         num_particles: int,
         actions_per_plan: int,
         device: torch.device,
+        time_budget: float | None = None,
     ):
+        if time_budget is not None and not (math.isfinite(time_budget) and time_budget > 0):
+            raise ValueError(f"time_budget must be a positive number of seconds, or None, got {time_budget}")
+        self.time_budget = time_budget
+        self.num_late = 0
+        """Plans that took longer than the budget, since this object was made."""
         self.dynamics, self.planner = dynamics, planner
         self.num_particles, self.actions_per_plan, self.device = num_particles, actions_per_plan, device
         self.cold = PlanState(planner.initial_plan())
@@ -60,6 +70,9 @@ class PlanningPolicy:
     ) -> tuple[np.ndarray, PlanState, PlanInfo | None]:
         """One action from the carried plan; if none of its actions are left, optimise it first.
 
+        With a time budget the planner is told until when it may go on, and returns the best plan so far. Drawing the
+        worlds is part of the budget; a plan that was late all the same is counted.
+
         Args:
             task: the reward and termination to plan with.
             observation: [S].
@@ -74,13 +87,17 @@ class PlanningPolicy:
         """
         plan, age, info = *state, None
         if age == 0:
+            deadline = math.inf if self.time_budget is None else time.perf_counter() + self.time_budget
+            # A planner need not know of deadlines as long as none is asked for.
+            limit = {} if self.time_budget is None else {"deadline": deadline}
             worlds = self.dynamics.draw(self.num_particles, self.horizon, generator)
             start = torch.as_tensor(observation, dtype=torch.float32, device=self.device)
             objective = rollout_objective(worlds, task.reward_fn, start, self.num_particles, task.terminated_fn)
             try:
-                plan, info = self.planner.plan(objective, plan, generator)
+                plan, info = self.planner.plan(objective, plan, generator, **limit)
             except PlanningError as error:
                 raise PlanningError(f"{error}; planning started from the observation {observation}") from error
+            self.num_late += time.perf_counter() > deadline
         action = plan.mean[age].clamp(self._low, self._high).cpu().numpy()
         age += 1
         carried = PlanState(plan, age) if age < self.actions_per_plan else PlanState(self.planner.shift(plan, age))

@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from torch import Tensor
 
+from gym_dgpmpc.agents.env_state import remember_starts
 from gym_dgpmpc.errors import UnknownRewardError
 from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
 
@@ -28,13 +29,14 @@ class Task(NamedTuple):
 
 
 def wrapped_env(env: GymEnv | str) -> VecEnv:
-    """The environment, or the registered one of this id, as a monitored VecEnv that can be planned for.
+    """The environment, or the registered one of this id, as a monitored VecEnv that can be planned for and resumed.
 
     Raises:
         ValueError, AssertionError: see `check_env`.
     """
     vec_env = BaseAlgorithm._wrap_env(maybe_make_env(env, 0))
     check_env(vec_env)
+    remember_starts(vec_env)
     return vec_env
 
 

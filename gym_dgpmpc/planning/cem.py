@@ -5,6 +5,7 @@ truncation and the variance cap are in their published code rather than in the t
 """
 
 import math
+import time
 
 import torch
 from jaxtyping import Float
@@ -97,11 +98,17 @@ class CEM:
         return self._widened(torch.cat([plan.mean[num_actions:], self._midpoint(num_actions)]))
 
     @torch.no_grad()
-    def plan(self, objective: Objective, plan: Plan, generator: torch.Generator) -> tuple[Plan, PlanInfo]:
+    def plan(
+        self, objective: Objective, plan: Plan, generator: torch.Generator, deadline: float | None = None
+    ) -> tuple[Plan, PlanInfo]:
         """Maximise ``objective`` from ``plan``.
 
         A score that is not finite counts as minus infinity and is never an elite; with fewer finite scores than
         elites, the finite ones alone are fitted.
+
+        Args:
+            deadline: a time of `time.perf_counter`. No iteration begins that would not end by then, were it as slow as
+                the slowest so far; with no time for a single one the result is ``plan`` within the bounds.
 
         Raises:
             PlanningError: no candidate of an iteration had a finite score.
@@ -111,8 +118,11 @@ class CEM:
         low, high = self.action_low, self.action_high
         mean, variance = plan.mean.clamp(low, high), plan.std.square()
         shape = (self.num_candidates, self.horizon, low.shape[0])
-        num_nonfinite = 0
+        num_nonfinite, iterations_done, expected_return = 0, 0, math.nan
+        now, slowest = time.perf_counter(), 0.0
         for iteration in range(1, self.num_iterations + 1):
+            if deadline is not None and now + slowest >= deadline:
+                break
             # Sample candidates from the truncated normal; the cap on its std keeps +-2 std within the bounds, so the
             # clamp only removes rounding. The cap is for sampling alone and does not enter the recursion below.
             room = torch.minimum(mean - low, high - mean)
@@ -146,10 +156,12 @@ class CEM:
                     f"none of the {self.num_candidates} candidate action sequences had a finite score in iteration "
                     f"{iteration} ({num_nonfinite} non-finite scores in this plan); the model or the reward diverges"
                 )
+            iterations_done, before, now = iteration, now, time.perf_counter()
+            slowest = max(slowest, now - before)
             if is_narrow:
                 break
         plan = Plan(mean.clamp(low, high), variance.sqrt())
-        return plan, PlanInfo(expected_return, num_nonfinite, iteration)
+        return plan, PlanInfo(expected_return, num_nonfinite, iterations_done)
 
     def _midpoint(self, length: int) -> Float[Tensor, "length A"]:
         return (self.action_low / 2 + self.action_high / 2).expand(length, -1).clone()

@@ -11,6 +11,7 @@ from numpy import ndarray
 from stable_baselines3.common.callbacks import BaseCallback
 
 from gym_dgpmpc.agents import MPCAgent
+from gym_dgpmpc.agents.randomness import derive_seed
 from gym_dgpmpc.planning.rollout import rollout
 from gym_dgpmpc.reporting.figures import Forecast
 from gym_dgpmpc.reporting.rendering import shrink
@@ -93,7 +94,9 @@ class ForecastCallback(BaseCallback):
     """Draws worlds early in each planned episode, and when it has ended compares them with what happened.
 
     The worlds are drawn when the step that they start from has just been made, so the model has not seen what it
-    predicts. They have a generator of their own and leave the run as it is without them.
+    predicts. Their generator depends on the seed and the step alone: they leave the run as it is without them, and a
+    run that goes on draws what it would have drawn. (Forecasts that had been begun when a run was killed within an
+    episode are missing from it.)
 
     Args:
         agent: the agent that learns.
@@ -107,7 +110,6 @@ class ForecastCallback(BaseCallback):
         self.horizon = agent.planning.horizon
         self.forecasts: list[Forecast] = []
         """Those of the last planned episode that ended."""
-        self._generator = torch.Generator(agent.device).manual_seed(0)
         self._worlds: dict[int, TransitionSampler] = {}
 
     def _on_step(self) -> bool:
@@ -118,7 +120,9 @@ class ForecastCallback(BaseCallback):
                 self.forecasts = [self._compare(episode, start) for start in starts]
             self._worlds = {}
         elif self.agent.is_fitted and self.recorder.num_steps in (1, 1 + self.horizon):
-            worlds = self.agent.dynamics.draw(self.num_particles, self.horizon, self._generator)
+            seed = derive_seed(self.agent.seed, "forecast", self.agent.num_timesteps)
+            generator = torch.Generator(self.agent.device).manual_seed(seed)
+            worlds = self.agent.dynamics.draw(self.num_particles, self.horizon, generator)
             self._worlds[self.recorder.num_steps] = worlds
         return True
 

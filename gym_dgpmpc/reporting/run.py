@@ -1,11 +1,13 @@
 """A training run and its folder: results as they come, a saved agent after every episode, figures at the end.
 
-The folder holds `settings.json` (what was asked, with which versions), `episodes.csv` (raw results), `agent.zip`,
-`tensorboard/`, and after the run `learning_curve.png`, `prediction_fan.png` and `last_episode.gif`.
+The folder holds `settings.json` (what was asked, with which versions), `episodes.csv` (raw results), `agent.zip` (and
+`agent.previous.zip`, the one before), `tensorboard/`, and when the run ends `learning_curve.png`, `prediction_fan.png`
+and `last_episode.gif`. A run that was killed goes on to the same files; only what tells the time differs.
 """
 
 import csv
 import importlib.metadata
+import io
 import json
 import os
 import platform
@@ -20,13 +22,16 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from gym_dgpmpc.agents import DGPMPCAgent
+from gym_dgpmpc.agents.files import replace_text
+from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
+from gym_dgpmpc.agents.safeguard import resume_from
 from gym_dgpmpc.errors import DGPMPCError
 from gym_dgpmpc.reporting.figures import observation_labels, plot_learning_curve, plot_prediction_fan
 from gym_dgpmpc.reporting.recording import EpisodeRecorder, ForecastCallback
 from gym_dgpmpc.reporting.rendering import write_gif
 
 PACKAGES = ("gym-dgpmpc", "gymnasium", "mujoco", "numpy", "stable-baselines3", "torch")
-AGENT_FILE, SETTINGS_FILE, EPISODES_FILE, LOGS = "agent.zip", "settings.json", "episodes.csv", "tensorboard"
+SETTINGS_FILE, EPISODES_FILE, LOGS, LOG_NAME = "settings.json", "episodes.csv", "tensorboard", "DGPMPC"
 FIGURES = LEARNING_CURVE, PREDICTION_FAN, LAST_EPISODE = "learning_curve.png", "prediction_fan.png", "last_episode.gif"
 
 
@@ -61,7 +66,7 @@ class EpisodeRow(NamedTuple):
 
 
 class RunFolder:
-    """The files of one run.
+    """The files of one run, held by this process until `close`.
 
     Args:
         path: the folder; made if there is none.
@@ -70,27 +75,41 @@ class RunFolder:
 
     Raises:
         RunFolderError: the folder holds a run with other settings.
-        OSError: it cannot be written.
+        RunInUseError: another process holds it.
+        CheckpointWriteError: it cannot be written to. It is an OSError too.
     """
 
     def __init__(self, path: Path, settings: dict[str, Any], *, overwrite: bool = False):
         self.path, self.settings = path, json.loads(json.dumps(settings))
-        self.agent_file, self.episodes_file = path / AGENT_FILE, path / EPISODES_FILE
-        if overwrite:
-            for name in (AGENT_FILE, SETTINGS_FILE, EPISODES_FILE, *FIGURES):
-                (path / name).unlink(missing_ok=True)
-            shutil.rmtree(path / LOGS, ignore_errors=True)
-        self.goes_on = self.agent_file.exists()
-        if self.goes_on:
-            self._refuse_other_settings()
-        path.mkdir(parents=True, exist_ok=True)
+        self.checkpoints = RunCheckpoints(path)
+        self.agent_file, self.episodes_file = self.checkpoints.newest, path / EPISODES_FILE
+        try:
+            if overwrite:
+                self.checkpoints.delete()
+                for name in (SETTINGS_FILE, EPISODES_FILE, *FIGURES):
+                    (path / name).unlink(missing_ok=True)
+                shutil.rmtree(path / LOGS, ignore_errors=True)
+            self.goes_on = self.checkpoints.exist
+            if self.goes_on:
+                self._refuse_other_settings()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let another process have the folder."""
+        self.checkpoints.close()
 
     def write_settings(self, **facts: Any) -> None:
-        """Write settings, versions and machine; ``facts`` are told but do not identify the run."""
+        """Write settings, versions and machine; ``facts`` are told but do not identify the run.
+
+        Of a run that goes on, the time at which it started stays.
+        """
+        now = datetime.now(timezone.utc).isoformat(timespec="seconds")
         content = {
             "settings": self.settings,
             **facts,
-            "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            "started": self._settings_before().get("started", now) if self.goes_on else now,
             "versions": {"python": platform.python_version()}
             | {name: importlib.metadata.version(name) for name in PACKAGES},
             "machine": {
@@ -100,7 +119,7 @@ class RunFolder:
                 "threads": torch.get_num_threads(),
             },
         }
-        (self.path / SETTINGS_FILE).write_text(json.dumps(content, indent=2) + "\n")
+        replace_text(self.path / SETTINGS_FILE, json.dumps(content, indent=2) + "\n")
 
     def rows(self) -> list[EpisodeRow]:
         """All episodes so far."""
@@ -110,17 +129,17 @@ class RunFolder:
             return [EpisodeRow.from_text(row) for row in csv.DictReader(file)]
 
     def write_rows(self, rows: list[EpisodeRow]) -> None:
-        """Replace all rows, the column names included."""
-        with self.episodes_file.open("w", newline="") as file:
-            csv.writer(file).writerows([EpisodeRow._fields, *rows])
+        """Replace all rows, the column names included; a kill leaves the old rows or the new ones."""
+        text = io.StringIO(newline="")
+        csv.writer(text).writerows([EpisodeRow._fields, *rows])
+        replace_text(self.episodes_file, text.getvalue())
 
-    def append_row(self, row: EpisodeRow) -> None:
-        with self.episodes_file.open("a", newline="") as file:
-            csv.writer(file).writerow(row)
+    def _settings_before(self) -> dict[str, Any]:
+        return json.loads((self.path / SETTINGS_FILE).read_text())
 
     def _refuse_other_settings(self) -> None:
         try:
-            before = json.loads((self.path / SETTINGS_FILE).read_text())["settings"]
+            before = self._settings_before()["settings"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise RunFolderError(f"{self.path} holds an agent without readable {SETTINGS_FILE}: {error}") from error
         differing = [
@@ -136,7 +155,7 @@ class RunFolder:
 
 
 class TrainingRun:
-    """One agent in one environment, recorded in a folder; goes on where the folder's last finished episode ended.
+    """One agent in one environment, recorded in a folder; goes on where the folder's newest checkpoint was written.
 
     Args:
         folder: where to record.
@@ -144,6 +163,11 @@ class TrainingRun:
         agent_arguments: of `DGPMPCAgent`.
         num_episodes: planned episodes after which to stop, or None.
         total_timesteps: environment steps after which to stop, the random ones included.
+        checkpoint_every: see `MPCAgent.learn`.
+        title: of the figures.
+
+    Raises:
+        CheckpointError: the folder's checkpoints are damaged, or of another agent.
     """
 
     def __init__(
@@ -154,23 +178,30 @@ class TrainingRun:
         *,
         num_episodes: int | None,
         total_timesteps: int,
+        checkpoint_every: int | None = None,
+        title: str = "",
     ):
         self.folder, self.num_episodes, self.total_timesteps = folder, num_episodes, total_timesteps
+        self.checkpoint_every, self.title = checkpoint_every, title
         self.recorder = EpisodeRecorder(env)
-        always: dict[str, Any] = {"verbose": 1, "tensorboard_log": str(folder.path / LOGS)}
-        self.agent: DGPMPCAgent
-        if folder.goes_on:
-            self.agent = DGPMPCAgent.load(folder.agent_file, env=self.recorder, **always)
+        self.agent = DGPMPCAgent(self.recorder, **agent_arguments, verbose=1, tensorboard_log=str(folder.path / LOGS))
+        rows = []
+        if resume_from(self.agent, folder.checkpoints):
             # An episode whose row was written but whose agent was not saved will be played again.
             rows = [row for row in folder.rows() if row.total_steps <= self.agent.num_timesteps]
-        else:
-            self.agent, rows = DGPMPCAgent(self.recorder, **agent_arguments, **always), []
         folder.write_rows(rows)
+        self.figures: list[Path] = []
+        """The figures that were drawn, once the last episode has ended."""
         self.forecasts = ForecastCallback(self.agent, self.recorder)
 
     @property
     def is_complete(self) -> bool:
         """Whether everything that was asked for has been done before."""
+        return self._has_enough and not self.agent.is_training_due
+
+    @property
+    def _has_enough(self) -> bool:
+        """Whether there are as many episodes or steps as were asked for."""
         planned = sum(row.actions == "planned" for row in self.folder.rows())
         enough = self.num_episodes is not None and planned >= self.num_episodes
         return enough or self.agent.num_timesteps >= self.total_timesteps
@@ -179,19 +210,24 @@ class TrainingRun:
         """Learn until the end, and leave a model in the agent that has seen every finished episode.
 
         Raises:
-            DGPMPCError: planning or the environment failed; the agent of the last finished episode stays saved.
+            DGPMPCError: planning or the environment failed; everything that was observed is saved.
+            KeyboardInterrupt, SystemExit: Ctrl-C or SIGTERM; see `MPCAgent.learn`.
         """
         callback = CallbackList([self.forecasts, _KeepEpisodes(self)])
-        self.agent.learn(
-            self.total_timesteps - self.agent.num_timesteps,
-            callback,
-            tb_log_name="DGPMPC",
-            reset_num_timesteps=False,
-            progress_bar=progress_bar,
-        )
         # A run that the callback stops ends before its last episode is learned from; without steps `learn` only trains.
-        self.agent.learn(0, reset_num_timesteps=False)
-        self.agent.save(self.folder.agent_file)
+        steps = 0 if self._has_enough else self.total_timesteps - self.agent.num_timesteps
+        for steps_of_call in (steps, 0):
+            self.agent.learn(
+                steps_of_call,
+                callback,
+                tb_log_name=LOG_NAME,
+                reset_num_timesteps=not self.folder.checkpoints.exist,
+                progress_bar=progress_bar and steps_of_call > 0,
+                run_folder=self.folder.checkpoints,
+                checkpoint_every=self.checkpoint_every,
+            )
+        if not self.figures:
+            self.figures = self.write_figures(self.title)
 
     def write_figures(self, title: str) -> list[Path]:
         """Draw what there is to draw, and say which files were written."""
@@ -223,7 +259,10 @@ class TrainingRun:
 
 
 class _KeepEpisodes(BaseCallback):
-    """Writes each finished episode's row and saves the agent; stops after the planned episodes that were asked for."""
+    """Writes each finished episode's row; draws the figures and stops after those that were asked for.
+
+    All this comes before the episode's checkpoint, so that a kill in between plays the episode again.
+    """
 
     def __init__(self, run: TrainingRun):
         super().__init__()
@@ -244,7 +283,9 @@ class _KeepEpisodes(BaseCallback):
             total_steps=agent.num_timesteps,
             seconds=round(time.perf_counter() - self._since, 3),
         )
-        folder.append_row(row)
-        agent.save(folder.agent_file)
+        folder.write_rows([*rows, row])
         self._since = time.perf_counter()
-        return sum(row.actions == "planned" for row in [*rows, row]) != self.run.num_episodes
+        is_last = sum(row.actions == "planned" for row in [*rows, row]) == self.run.num_episodes
+        if is_last or agent.num_timesteps >= self.run.total_timesteps:
+            self.run.figures = self.run.write_figures(self.run.title)
+        return not is_last

@@ -4,7 +4,9 @@ import io
 import json
 import os
 import pickle
+import shutil
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ import torch
 from gymnasium import spaces
 
 from gym_dgpmpc import MPCAgent
-from gym_dgpmpc.agents import checkpoint
+from gym_dgpmpc.agents import reading
 from gym_dgpmpc.agents.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from gym_dgpmpc.errors import CheckpointError, UnknownRewardError
 from tests.agents.point_mass import (
@@ -121,6 +123,8 @@ def test_the_same_agent_gives_the_same_bytes(tmp_path):
     for config in (one.config, other.config):
         for info in config["episode_infos"]:
             info.pop("t")
+    for checkpoint_ in (one, other):
+        checkpoint_.tensors["agent"].pop("record.seconds")  # wall-clock time
     assert one.config == other.config
     assert all(torch.equal(one.tensors[p][n], other.tensors[p][n]) for p in one.tensors for n in one.tensors[p])
 
@@ -185,7 +189,7 @@ def zipped(path, members, **options):
 
 def changed(saved, path, change):
     """The saved file with its config edited, checksums right."""
-    config, tensors = read_checkpoint(saved)
+    config, tensors, _ = read_checkpoint(saved)
     change(config, tensors)
     write_checkpoint(Checkpoint(config, tensors), path)
     return path
@@ -261,13 +265,22 @@ def test_a_newer_schema_says_what_to_do(saved, tmp_path):
     members = members_of(saved)
     manifest = json.loads(members["manifest.json"])
     members["manifest.json"] = json.dumps(manifest | {"schema": 99}).encode()
-    with pytest.raises(CheckpointError, match=r"schema 99.*reads up to 1.*version that wrote it"):
+    with pytest.raises(CheckpointError, match=r"schema 99.*reads up to 2.*version that wrote it"):
         load(zipped(tmp_path / "file.zip", members))
     members["manifest.json"] = json.dumps(manifest | {"format": "something else"}).encode()
     with pytest.raises(CheckpointError, match="its format is 'something else'"):
         load(zipped(tmp_path / "file.zip", members))
     members["manifest.json"] = b"[" * 100_000
     with pytest.raises(CheckpointError, match="damaged"):
+        load(zipped(tmp_path / "file.zip", members))
+    members["manifest.json"] = b'{"a": 1, "a": 2}'
+    with pytest.raises(CheckpointError, match="names something twice"):
+        load(zipped(tmp_path / "file.zip", members))
+    members["manifest.json"] = b'{"a": NaN}'
+    with pytest.raises(CheckpointError, match="the number NaN"):
+        load(zipped(tmp_path / "file.zip", members))
+    members["manifest.json"] = b'{"a": ' + b"9" * 500 + b"}"
+    with pytest.raises(CheckpointError, match="500 digits"):
         load(zipped(tmp_path / "file.zip", members))
     members["manifest.json"] = b"[]"
     with pytest.raises(CheckpointError, match="not an object"):
@@ -287,11 +300,11 @@ def test_compressed_additional_and_repeated_members(saved, tmp_path):
 
 
 def test_sizes_are_bounded(saved, tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoint, "MAX_JSON_BYTES", 100)
+    monkeypatch.setattr(reading, "MAX_JSON_BYTES", 100)
     with pytest.raises(CheckpointError, match=r"'config.json' is compressed or larger"):
         load(saved)
-    monkeypatch.setattr(checkpoint, "MAX_FILE_BYTES", 100)
-    with pytest.raises(CheckpointError, match="more than a checkpoint may have"):
+    monkeypatch.setattr(reading, "MAX_FILE_BYTES", 100)
+    with pytest.raises(CheckpointError, match="more than an agent's file may have"):
         load(saved)
 
 
@@ -305,7 +318,7 @@ def test_sizes_are_bounded(saved, tmp_path, monkeypatch):
         (lambda c, t: c["arguments"].update(env="evil:Env-v0"), "arguments are not those"),
         (lambda c, t: c["arguments"].update(num_particles="many"), "no MPCAgent can be made"),
         (lambda c, t: c["arguments"].update(num_particles=10**12), "num_particles = 1000000000000 is larger"),
-        (lambda c, t: c["arguments"].update(num_particles=float("nan")), "num_particles = nan"),
+        (lambda c, t: c["arguments"].update(num_particles=10**5), "num_particles = 100000 is larger"),
         (lambda c, t: c["arguments"].update(seed=-3), "no MPCAgent can be made"),
         (lambda c, t: c["arguments"].update(verbose={"a": 1}), "argument that cannot be read"),
         (lambda c, t: c.pop("arguments"), "arguments are not those"),
@@ -327,6 +340,33 @@ def test_sizes_are_bounded(saved, tmp_path, monkeypatch):
 def test_contents_that_do_not_fit_are_named(change, message, saved, tmp_path):
     with pytest.raises(CheckpointError, match=message):
         load(changed(saved, tmp_path / "changed.zip", change))
+
+
+def test_a_file_of_the_first_schema_goes_on():
+    """Written by the package before it kept what a running episode needs."""
+    from gym_dgpmpc import DGPMPCAgent
+    from tests.reporting.toy import EPISODE_STEPS, SMALLEST_AGENT
+
+    path = Path(__file__).parent / "files" / "schema1.zip"
+    assert read_checkpoint(path).schema == 1
+    loaded = MPCAgent.load(path, env="ToyPush-v0")
+    assert isinstance(loaded, DGPMPCAgent)
+    assert loaded.num_timesteps == len(loaded.store) == loaded.num_fitted == 2 * EPISODE_STEPS
+    assert loaded.num_inducing == SMALLEST_AGENT["num_inducing"]
+    assert loaded.time_budget is None
+    assert loaded.action_space.contains(loaded.predict(np.zeros(2), deterministic=True)[0])
+    assert len(loaded.learn(EPISODE_STEPS, reset_num_timesteps=False).store) == 3 * EPISODE_STEPS
+
+
+def test_a_run_of_the_first_schema_goes_on(tmp_path):
+    from gym_dgpmpc import DGPMPCAgent
+    from tests.reporting.toy import EPISODE_STEPS, SMALLEST_AGENT
+
+    shutil.copy(Path(__file__).parent / "files" / "schema1.zip", tmp_path / "agent.zip")
+    learner = DGPMPCAgent("ToyPush-v0", seed=0, **SMALLEST_AGENT)
+    learner.learn(3 * EPISODE_STEPS, run_folder=tmp_path, resume=True)
+    assert learner.num_timesteps == 3 * EPISODE_STEPS
+    assert read_checkpoint(tmp_path / "agent.zip").schema == 2
 
 
 def test_classes_are_checked(saved, tmp_path):

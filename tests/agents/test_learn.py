@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gym_dgpmpc.errors import EnvironmentDataError, PlanningError
+from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError, PlanningError
 from tests.agents.point_mass import LENGTH, KnownPointMass, LinearModel, actions_of, agent, planner
 
 
@@ -215,11 +215,26 @@ def test_a_reset_that_is_not_finite():
 
 def test_an_environment_that_raises():
     learner = agent(KnownPointMass(fail_at=13, failure=ConnectionError("the plant is gone")))
-    with pytest.raises(ConnectionError, match="the plant is gone"):
+    with pytest.raises(EnvironmentFailedError, match=r"^step 13: .*step raised ConnectionError: the plant") as raised:
         learner.learn(30)
+    assert isinstance(raised.value.__cause__, ConnectionError)
     assert len(learner.store) == 13
     learner.learn(17, reset_num_timesteps=False)
     assert len(learner.store) == 30
+
+
+def test_an_environment_whose_reset_raises_keeps_the_step_that_ended_the_episode():
+    env = KnownPointMass()
+    learner = agent(env)
+    reset = env.reset
+    env.reset = lambda **kwargs: reset(**kwargs) if env.num_steps != 2 * LENGTH else 1 / 0
+    with pytest.raises(EnvironmentFailedError, match=r"step 19: the environment's reset raised ZeroDivisionError"):
+        learner.learn(30)
+    assert len(learner.store) == learner.num_timesteps == 2 * LENGTH
+    env.reset = reset
+    learner.learn(10, reset_num_timesteps=False)
+    assert learner.dynamics.fits == [10, 20, 30]
+    assert learner.store.episodes.tolist() == [i // LENGTH for i in range(30)]
 
 
 def test_training_that_fails_can_be_tried_again():

@@ -6,6 +6,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from gym_dgpmpc.agents import DGPMPCAgent
+from gym_dgpmpc.agents.randomness import derive_seed
 from gym_dgpmpc.planning import rollout
 from gym_dgpmpc.reporting.recording import EpisodeRecorder, ForecastCallback
 from tests.reporting.toy import EPISODE_STEPS, SMALLEST_AGENT
@@ -56,12 +57,12 @@ class DrawItself(BaseCallback):
     def __init__(self, agent, recorder):
         super().__init__()
         self.agent, self.recorder, self.worlds = agent, recorder, {}
-        self.generator = torch.Generator().manual_seed(0)
 
     def _on_step(self):
         done = bool(self.locals["dones"][0])
         if not done and self.agent.is_fitted and self.recorder.num_steps in (1, 4):
-            self.worlds[self.recorder.num_steps] = self.agent.dynamics.draw(20, 3, self.generator)
+            generator = torch.Generator().manual_seed(derive_seed(self.agent.seed, "forecast", self.num_timesteps))
+            self.worlds[self.recorder.num_steps] = self.agent.dynamics.draw(20, 3, generator)
         return True
 
 

@@ -11,11 +11,15 @@ from gym_dgpmpc.errors import PlanningError
 from gym_dgpmpc.reporting.run import RunFolder, RunFolderError, TrainingRun
 from tests.reporting.toy import EPISODE_STEPS, SMALLEST_AGENT
 
+HOLDERS = []
 SETTINGS = {"environment": "ToyPush-v0", "seed": 0}
 
 
 def training_run(path, num_episodes=2, env_id="ToyPush-v0", **env_arguments):
+    for holder in HOLDERS:  # what an earlier process would have let go of by its end
+        holder.close()
     folder = RunFolder(path, SETTINGS)
+    HOLDERS[:] = [folder]
     env = gymnasium.make(env_id, **env_arguments)
     steps = EPISODE_STEPS * (1 + num_episodes)
     run = TrainingRun(folder, env, SMALLEST_AGENT | {"seed": 0}, num_episodes=num_episodes, total_timesteps=steps)
@@ -77,6 +81,39 @@ def test_goes_on(tmp_path):
     assert len(DGPMPCAgent.load(run.folder.agent_file).store) == 48
 
 
+@pytest.mark.parametrize("total", [24, 30])
+def test_a_run_that_was_killed_before_its_last_training_is_not_complete(tmp_path, monkeypatch, total):
+    def run_of(total_timesteps):
+        HOLDERS[:] = [holder.close() for holder in HOLDERS][:0]
+        folder = RunFolder(tmp_path, SETTINGS)
+        HOLDERS.append(folder)
+        env = gymnasium.make("ToyPush-v0")
+        run = TrainingRun(folder, env, SMALLEST_AGENT | {"seed": 0}, num_episodes=None, total_timesteps=total_timesteps)
+        folder.write_settings()
+        return run
+
+    run = run_of(total)
+    fit = run.agent.dynamics.fit
+
+    def killed_in_the_second(data, generator):
+        if len(data.action) == 24:
+            raise KeyboardInterrupt
+        return fit(data, generator)
+
+    monkeypatch.setattr(run.agent.dynamics, "fit", killed_in_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        run.train(progress_bar=False)
+    assert (tmp_path / "prediction_fan.png").exists() == (
+        total == 24
+    )  # drawn before the checkpoint of the last episode
+    run = run_of(total)
+    assert not run.is_complete
+    run.train(progress_bar=False)
+    assert run.agent.num_timesteps == total
+    assert run.agent.num_fitted == 24
+    assert run_of(total).is_complete
+
+
 class InterruptAt(BaseCallback):
     def __init__(self, step):
         super().__init__()
@@ -94,7 +131,7 @@ def test_goes_on_after_an_interruption_within_an_episode(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run.train(progress_bar=False)
     # As if the interruption had come between the row of an episode and the saving of its agent.
-    run.folder.append_row(run.folder.rows()[-1]._replace(episode=3, total_steps=36))
+    run.folder.write_rows([*run.folder.rows(), run.folder.rows()[-1]._replace(episode=3, total_steps=36)])
 
     run = training_run(tmp_path)
     assert run.agent.num_timesteps == 24
@@ -121,6 +158,7 @@ def test_what_was_finished_survives_a_failure(tmp_path, monkeypatch):
 
 def test_refuses_another_runs_folder(tmp_path):
     training_run(tmp_path, num_episodes=1).train(progress_bar=False)
+    HOLDERS[0].close()
     with pytest.raises(RunFolderError, match=r"other settings .seed was 0, now 1.*--overwrite"):
         RunFolder(tmp_path, SETTINGS | {"seed": 1})
     (tmp_path / "settings.json").write_text("[]")
@@ -133,6 +171,7 @@ def test_overwrites_only_when_asked(tmp_path):
     run.train(progress_bar=False)
     run.write_figures("")
     (tmp_path / "notes.txt").write_text("mine")
+    HOLDERS[0].close()
     folder = RunFolder(tmp_path, {"seed": 1}, overwrite=True)
     assert not folder.goes_on
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", ".lock-holder.json", "notes.txt"]

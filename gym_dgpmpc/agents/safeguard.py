@@ -1,0 +1,162 @@
+"""What keeps a run safe while it learns: checkpoints as it goes, a last one when it fails, and clean stops."""
+
+import os
+import warnings
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from stable_baselines3.common.utils import get_latest_run_id
+
+from gym_dgpmpc.agents.env_state import can_replay, episode_start
+from gym_dgpmpc.agents.event_files import drop_events_after
+from gym_dgpmpc.agents.resuming import resume_agent
+from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
+from gym_dgpmpc.agents.saving import collect
+from gym_dgpmpc.agents.stopping import StopRequests
+from gym_dgpmpc.errors import CheckpointError, ReliabilityWarning
+
+
+class Safeguard:
+    """A context around one call of `MPCAgent.learn` with a run's folder.
+
+    On entering, the folder is taken hold of, and the agent goes on from it if it should. Inside, `begin` writes a first
+    checkpoint, so that a run killed within its first episode is known to be one; `after_step` writes checkpoints and
+    heeds requests to stop. On an exception everything gathered so far is written.
+
+    Args:
+        agent: the `MPCAgent` that learns.
+        run_folder: the folder, or the checkpoints of one that is held already.
+        resume: go on from the folder's checkpoint, if there is one.
+        checkpoint_every: environment steps between two checkpoints within an episode, beside those after each; None
+            for the latter alone.
+
+    Raises:
+        RunInUseError, CheckpointWriteError: see `RunCheckpoints`.
+        CheckpointError: the folder holds a run although none is to be resumed; or see `resume_agent`.
+        ValueError: ``checkpoint_every`` is not positive.
+    """
+
+    def __init__(
+        self,
+        agent: Any,
+        run_folder: str | os.PathLike[str] | RunCheckpoints,
+        *,
+        resume: bool,
+        checkpoint_every: int | None,
+    ):
+        if checkpoint_every is not None and checkpoint_every < 1:
+            raise ValueError(f"checkpoint_every must be at least 1, got {checkpoint_every}")
+        self.agent, self.run_folder, self.resume, self.every = agent, run_folder, resume, checkpoint_every
+        self.stop = StopRequests()
+        self._stack = ExitStack()
+        self._saved: tuple[int, int] | None = None  # steps and fitted transitions of the last checkpoint
+
+    def __enter__(self) -> "Safeguard":
+        with ExitStack() as stack:
+            if isinstance(self.run_folder, RunCheckpoints):
+                self.checkpoints = self.run_folder
+            else:
+                self.checkpoints = stack.enter_context(RunCheckpoints(self.run_folder))
+                if self.checkpoints.exist and not self.resume:
+                    raise CheckpointError(
+                        f"{self.checkpoints.folder} holds a run: pass resume=True to go on with it, or choose another "
+                        "folder"
+                    )
+            if self.resume:
+                resume_from(self.agent, self.checkpoints)
+            self._goes_on = self.checkpoints.exist
+            stack.enter_context(self.stop)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        with self._stack:
+            if error is None:
+                if self._saved != self._present():
+                    self._save()
+                if self.stop.received is not None:  # after the last step
+                    self.stop.stop()
+            elif isinstance(error, Exception):
+                try:
+                    self._save(gives_up=True)
+                except Exception as another:  # must not hide what happened first
+                    warnings.warn(
+                        f"no checkpoint could be written after that error: {another}", ReliabilityWarning, stacklevel=2
+                    )
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the folder held a run, which the agent goes on with."""
+        return self._goes_on
+
+    def begin(self) -> None:
+        """Write the first checkpoint of a run."""
+        if not self._goes_on:
+            self._save()
+
+    def after_step(self, *, episode_ended: bool) -> None:
+        """Write a checkpoint if one is due, and stop if that was asked for.
+
+        Raises:
+            KeyboardInterrupt, SystemExit: see `StopRequests`.
+            CheckpointWriteError: the checkpoint cannot be written.
+        """
+        stopping = self.stop.received is not None
+        every = self.every is not None and self.agent.num_timesteps % self.every == 0
+        if episode_ended or ((stopping or every) and self._can_go_on_within_an_episode()):
+            self._save()
+        if stopping:
+            self.stop.stop()
+
+    def _can_go_on_within_an_episode(self) -> bool:
+        start = episode_start(self.agent.env)
+        if start is not None and can_replay(start):
+            return True
+        if self.every is not None:
+            self.agent._warn_once(
+                "checkpoint_every is without effect, because this environment cannot be brought back into the middle "
+                "of an episode: checkpoints are written when episodes end. A simulator that repeats an episode when "
+                "it is given the same actions may say so with an attribute can_replay = True"
+            )
+        return False
+
+    def _save(self, *, gives_up: bool = False) -> None:
+        self.checkpoints.save(collect(self.agent, gives_up=gives_up))
+        self._saved = self._present()
+
+    def _present(self) -> tuple[int, int]:
+        return self.agent.num_timesteps, self.agent.num_fitted
+
+
+def resume_from(agent: Any, checkpoints: RunCheckpoints) -> bool:
+    """Go on from the newest checkpoint that is whole; False if there is none.
+
+    Raises:
+        CheckpointError: see `RunCheckpoints.load` and `resume_agent`.
+    """
+    checkpoint = checkpoints.load()
+    if checkpoint is not None:
+        resume_agent(agent, checkpoint)
+    return checkpoint is not None
+
+
+def continue_logs(agent: Any, tb_log_name: str) -> None:
+    """Drop what was logged after the agent's checkpoint, for it will be logged again; see `event_files`.
+
+    Stable-Baselines3 goes on in the newest folder of that name: if it is not the run's, nothing is dropped.
+    """
+    if agent.tensorboard_log is None or agent._log_run is None:
+        return
+    newest = f"{tb_log_name}_{get_latest_run_id(agent.tensorboard_log, tb_log_name)}"
+    if newest == agent._log_run:
+        drop_events_after(agent.num_timesteps, Path(agent.tensorboard_log) / newest)
+    elif os.path.isdir(os.path.join(agent.tensorboard_log, agent._log_run)):
+        warnings.warn(
+            f"the run has logged in {agent._log_run}, but {newest} is newer: the curve goes on there",
+            ReliabilityWarning,
+            stacklevel=2,
+        )
