@@ -1,7 +1,7 @@
 """How well a model trained on one random episode knows what it does not know: `python -m benchmarks.calibration`.
 
-Trains on the modified cart-pole with and without exact draws of the last layer, and tests H-step predictions on
-episodes of smoother random actions, which go elsewhere. Writes `calibration.md` and `calibration.json`.
+Trains on the modified cart-pole in several ways, and tests H-step predictions on episodes of smoother random actions,
+which go elsewhere. Writes `calibration.md` and `calibration.json`; what is in the latter already is not done again.
 """
 
 import argparse
@@ -18,6 +18,17 @@ import torch
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
 from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.types import Transitions
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    # SG-HMC alone gets five times the steps between samples.
+    "SG-HMC alone": {"sample_spacing": 50, "gibbs_every": 0},
+    "exact draws of the last layer (default)": {},
+    "hyperparameters every 2nd step": {"hyperparameters_every": 2},
+    "hyperparameters every 4th step": {"hyperparameters_every": 4},
+    "half the iterations": {"first_iterations": 2000},
+    "stopped early, patience 5": {"patience": 5},
+}
+"""Ways of training, as arguments of `DeepGPDynamics` or `InferenceSettings`."""
 
 ENVIRONMENT, TEST_SEEDS, NUM_PARTICLES, NORMAL_90 = "ModCartPole-v0", range(5000, 5004), 100, 1.645
 
@@ -53,18 +64,20 @@ def score(
     return {"coverage_90": float(torch.stack(covered).mean()), "nll": float(torch.stack(likelihood).mean())}
 
 
-def measure(gibbs_every: int, spacing: int, seed: int, arguments: argparse.Namespace) -> dict[str, Any]:
+def measure(variant: str, seed: int, arguments: argparse.Namespace) -> dict[str, Any]:
     """One model on one random episode."""
     env, generator = gymnasium.make(ENVIRONMENT), torch.Generator().manual_seed(seed)
+    inference = {key: value for key, value in VARIANTS[variant].items() if key in InferenceSettings.__annotations__}
+    settings = {key: value for key, value in VARIANTS[variant].items() if key not in inference}
     model = DeepGPDynamics(
         4, 1, env.get_wrapper_attr("observation_spec"), num_layers=arguments.layers, kernel=arguments.kernel,
-        first_iterations=arguments.iterations, sample_spacing=spacing,
-        inference=InferenceSettings(gibbs_every=gibbs_every),
+        inference=InferenceSettings(**inference), **settings,
     )  # fmt: skip
-    started = time.perf_counter()
-    model.fit(episode(env, seed, 0.0), generator)
+    started = time.process_time()
+    metrics = model.fit(episode(env, seed, 0.0), generator)
+    row = {"variant": variant, "seed": seed, "cpu_seconds": time.process_time() - started}
+    row["iterations"] = metrics["iterations"]
     tests = [episode(env, test_seed, 0.8) for test_seed in TEST_SEEDS]
-    row = {"gibbs_every": gibbs_every, "spacing": spacing, "seed": seed, "seconds": time.perf_counter() - started}
     for horizon in (1, 15):
         row |= {f"{name}_{horizon}": value for name, value in score(model, tests, horizon, generator).items()}
     return row
@@ -74,22 +87,35 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.calibration", description=__doc__)
     parser.add_argument("--layers", type=int, default=2)
     parser.add_argument("--kernel", default="matern32")
-    parser.add_argument("--iterations", type=int, default=4000)
     parser.add_argument("--seeds", nargs="+", type=int, default=[100, 101])
     parser.add_argument("--results", type=Path, default=Path("benchmarks/results/calibration"))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    settings = ((0, 50), (20, 10))  # SG-HMC alone gets five times the steps between samples
-    rows = [measure(*setting, seed, arguments) for setting in settings for seed in arguments.seeds]
+    saved = arguments.results / "calibration.json"
+    rows = json.loads(saved.read_text())["rows"] if saved.exists() else []
+    done = {(row.get("variant"), row["seed"]) for row in rows}
+    wanted = [(variant, seed) for variant in VARIANTS for seed in arguments.seeds]
     command = f"python -m benchmarks.calibration {' '.join(sys.argv[1:])}".strip()
-    arguments.results.mkdir(parents=True, exist_ok=True)
+    for setting in wanted:
+        if setting not in done:
+            rows.append(measure(*setting, arguments))
+            write(rows, command, arguments.results)
+    print((arguments.results / "calibration.md").read_text())
+
+
+def write(rows: list[dict[str, Any]], command: str, results: Path) -> None:
+    """All rows so far, raw and as a table."""
+    results.mkdir(parents=True, exist_ok=True)
     facts = {"command": command, "environment": ENVIRONMENT, "torch": torch.__version__, "rows": rows}
-    (arguments.results / "calibration.json").write_text(json.dumps(facts, indent=2) + "\n")
-    names = [name for name in rows[0] if name != "seconds"]
+    (results / "calibration.json").write_text(json.dumps(facts, indent=2) + "\n")
+    names = list(rows[0])
     lines = [f"Made by `{command}`.", "", f"| {' | '.join(names)} |", "|" + "---|" * len(names)]
-    lines += ["| " + " | ".join(f"{row[name]:.2f}".removesuffix(".00") for name in names) + " |" for row in rows]
-    (arguments.results / "calibration.md").write_text("\n".join(lines) + "\n")
-    print("\n".join(lines))
+    lines += ["| " + " | ".join(_cell(row[name]) for name in names) + " |" for row in rows]
+    (results / "calibration.md").write_text("\n".join(lines) + "\n")
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.2f}" if isinstance(value, float) and value != int(value) else str(value)
 
 
 if __name__ == "__main__":

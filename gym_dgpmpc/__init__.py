@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from gym_dgpmpc.envs.registration import register_environments
 
 if TYPE_CHECKING:
-    from gym_dgpmpc.agents import DGPMPCAgent, MPCAgent
+    from gym_dgpmpc.agents import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent
     from gym_dgpmpc.envs import (
         BiasedReacherEnv,
         ModCartPoleEnv,
@@ -19,8 +19,10 @@ if TYPE_CHECKING:
 __all__ = [
     "BiasedReacherEnv",
     "DGPMPCAgent",
+    "GPMPCAgent",
     "MPCAgent",
     "ModCartPoleEnv",
+    "PETSAgent",
     "Reacher7DoFEnv",
     "RiskSensitiveReward",
     "SwingUpCartPoleEnv",
@@ -31,8 +33,10 @@ __all__ = [
 _MODULE_OF = {
     "BiasedReacherEnv": "gym_dgpmpc.envs",
     "DGPMPCAgent": "gym_dgpmpc.agents",
+    "GPMPCAgent": "gym_dgpmpc.agents",
     "MPCAgent": "gym_dgpmpc.agents",
     "ModCartPoleEnv": "gym_dgpmpc.envs",
+    "PETSAgent": "gym_dgpmpc.agents",
     "Reacher7DoFEnv": "gym_dgpmpc.envs",
     "RiskSensitiveReward": "gym_dgpmpc.wrappers",
     "SwingUpCartPoleEnv": "gym_dgpmpc.envs",

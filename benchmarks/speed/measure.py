@@ -27,6 +27,7 @@ from benchmarks.speed.cases import (
     timed,
     transitions,
 )
+from benchmarks.speed.inductor import compiled_step
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.deep_gp_start import initial_model
 from gym_dgpmpc.inference import mcem, sghmc
@@ -118,6 +119,13 @@ def parts(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
     )
 
 
+def inductor(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
+    """A rollout step by `torch.compile`."""
+    data = transitions(case, NUM_TRANSITIONS)
+    step, seconds = compiled_step(case, deep_gp(case, num_layers, data), data)
+    yield {"what": "rollout step", "how": "torch.compile", "seconds_to_compile": seconds} | timed(step, repeats)
+
+
 def scaling(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
     """A plan against K and M; a plan, a re-sampling and a training against N."""
     data = transitions(case, NUM_TRANSITIONS)
@@ -144,4 +152,4 @@ def scaling(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
         yield {"what": "extra memory, MB"} | varied | {"p50_ms": peak_memory_mb() - before, "repeats": 1}
 
 
-WORKERS = {"plans": plans, "training": training, "parts": parts, "scaling": scaling}
+WORKERS = {"plans": plans, "training": training, "parts": parts, "inductor": inductor, "scaling": scaling}

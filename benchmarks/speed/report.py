@@ -4,6 +4,11 @@ from typing import Any
 
 Row = dict[str, Any]
 
+EXTRA = (
+    "varied", "value", "extra_memory_mb", "seconds_to_compile", "product_gflops", "large_product_gflops", "by",
+)  # fmt: skip
+"""What some rows have besides their times."""
+
 
 def find(rows: list[Row], **wanted: Any) -> Row | None:
     """The first row with these values."""
@@ -50,8 +55,7 @@ def ratios(rows: list[Row]) -> str:
 
 def times(rows: list[Row], worker: str) -> str:
     """All times of one worker."""
-    extra = [k for k in ("varied", "value", "extra_memory_mb", "product_gflops", "large_product_gflops", "by")
-             if any(k in r for r in rows if r["worker"] == worker)]  # fmt: skip
+    extra = [key for key in EXTRA if any(key in row for row in rows if row["worker"] == worker)]
     lines = []
     for row in rows:
         if row["worker"] != worker:
@@ -91,6 +95,7 @@ def document(facts: Row, rows: list[Row]) -> str:
         "plans": "Plans and rollout steps",
         "training": "Training",
         "parts": "Where a plan's time goes",
+        "inductor": "By `torch.compile` instead",
         "scaling": "Scaling",
     }
     for worker, title in titles.items():

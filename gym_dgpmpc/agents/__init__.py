@@ -1,6 +1,8 @@
 """The agents: model-predictive control as Stable-Baselines3 algorithms, and the named methods made of its parts."""
 
 from gym_dgpmpc.agents.dgp_mpc import DGPMPCAgent
+from gym_dgpmpc.agents.gp_mpc import GPMPCAgent
 from gym_dgpmpc.agents.mpc import MPCAgent
+from gym_dgpmpc.agents.pets import PETSAgent
 
-__all__ = ["DGPMPCAgent", "MPCAgent"]
+__all__ = ["DGPMPCAgent", "GPMPCAgent", "MPCAgent", "PETSAgent"]

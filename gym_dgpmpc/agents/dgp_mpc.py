@@ -9,11 +9,11 @@ import torch
 from stable_baselines3.common.type_aliases import GymEnv
 
 from gym_dgpmpc.agents.mpc import MPCAgent
+from gym_dgpmpc.agents.parts import cem_planner
 from gym_dgpmpc.agents.task import Learned
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
 from gym_dgpmpc.dynamics.deep_gp_draws import Draw, Refresh
 from gym_dgpmpc.inference.mcem import InferenceSettings
-from gym_dgpmpc.planning.cem import CEM
 from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
 
 
@@ -161,16 +161,12 @@ class DGPMPCAgent(MPCAgent):
 
     def _setup_model(self) -> None:
         """Build the planner for the environment's spaces; the model follows when it is known what it has to predict."""
-        low, high = (
-            torch.as_tensor(bound, dtype=torch.float32, device=self.device).flatten()
-            for bound in (self.action_space.low, self.action_space.high)
-        )
-        self.planner = CEM(
-            action_low=low,
-            action_high=high,
+        self.planner = cem_planner(
+            self.action_space,
+            self.device,
             horizon=self.horizon,
             num_candidates=self.num_candidates,
-            num_elites=max(1, self.num_candidates // 10) if self.num_elites is None else self.num_elites,
+            num_elites=self.num_elites,
             num_iterations=self.num_iterations,
         )
         super()._setup_model()

@@ -1,4 +1,4 @@
-"""Settings as data: keyword arguments of `DGPMPCAgent` for a task, by the environment's id."""
+"""Settings as data: keyword arguments of an agent for a task, by the environment's id."""
 
 from types import MappingProxyType
 from typing import Any
@@ -34,3 +34,63 @@ PAPER = MappingProxyType(
     }
 )
 """The planning settings of Gadd et al. (2020); layers and kernel are what the paper compares, so they are not here."""
+
+REAL_TIME = MappingProxyType(
+    {"ModCartPole-v0": MappingProxyType({"num_candidates": 200, "num_elites": 20, "num_iterations": 4})}
+)
+"""Planning settings quick enough for a plant's own clock, to be laid over others: 25 plans a second on two cores."""
+
+
+def _networks(hidden: tuple[int, int], decay: tuple[float, ...], learning_rate: float) -> dict[str, Any]:
+    """An ensemble's layers and how they are trained."""
+    layers, size = hidden
+    return {
+        "num_hidden_layers": layers,
+        "hidden_size": size,
+        "weight_decay": decay,
+        "learning_rate": learning_rate,
+    }
+
+
+_CART_POLE_NETWORKS = _networks((3, 500), (1e-4, 2.5e-4, 2.5e-4, 5e-4), 1e-3)
+_REACHER_NETWORKS = _networks((4, 200), (2.5e-4, 5e-4, 5e-4, 5e-4, 7.5e-4), 7.5e-4)
+_HALF_CHEETAH_NETWORKS = _networks((4, 200), (2.5e-5, 5e-5, 7.5e-5, 7.5e-5, 1e-4), 1e-3)
+
+_NETWORKS = {
+    "ModCartPole-v0": _CART_POLE_NETWORKS,
+    "SwingUpCartPole-v0": _CART_POLE_NETWORKS,
+    "Reacher7DoF-v0": _REACHER_NETWORKS,
+    "BiasedReacher-v0": _REACHER_NETWORKS,
+    "VelocityHalfCheetah-v0": _HALF_CHEETAH_NETWORKS,
+    "RiskSensitiveHalfCheetah-v0": _HALF_CHEETAH_NETWORKS,
+}
+
+
+def _published(env_id: str) -> MappingProxyType[str, Any]:
+    is_cheetah = "HalfCheetah" in env_id
+    planning = {
+        "num_candidates": 500 if is_cheetah else 400,
+        "num_elites": 50 if is_cheetah else 40,
+        "num_iterations": 5,
+        "horizon": 30 if is_cheetah else 25,
+        "actions_per_plan": 1,
+        "num_particles": 20,
+    }
+    return MappingProxyType({**_NETWORKS[env_id], **planning})
+
+
+PETS = MappingProxyType({env_id: _published(env_id) for env_id in _NETWORKS})
+"""The settings of Chua et al. (2018), for `PETSAgent`: networks, their training, and planning."""
+
+COMPARISON_PETS = MappingProxyType(
+    {
+        env_id: MappingProxyType(
+            {**networks, **{name: value for name, value in PAPER[env_id].items() if name != "num_inducing"}}
+        )
+        for env_id, networks in _NETWORKS.items()
+    }
+)
+"""`PETSAgent` as in the comparison of Gadd et al.: PETS's networks, their planning, and one particle per network."""
+
+COMPARISON_GP = PAPER
+"""`GPMPCAgent` as in the comparison of Gadd et al.: their planning and number of inducing points."""

@@ -13,7 +13,12 @@ from gym_dgpmpc.agents.task import LEARNED
 from gym_dgpmpc.errors import CheckpointError
 from gym_dgpmpc.types import ObservationSpec
 
-AGENT_CLASSES = {"MPCAgent": "gym_dgpmpc.agents.mpc", "DGPMPCAgent": "gym_dgpmpc.agents.dgp_mpc"}
+AGENT_CLASSES = {
+    "MPCAgent": "gym_dgpmpc.agents.mpc",
+    "DGPMPCAgent": "gym_dgpmpc.agents.dgp_mpc",
+    "GPMPCAgent": "gym_dgpmpc.agents.gp_mpc",
+    "PETSAgent": "gym_dgpmpc.agents.pets",
+}
 """The classes that a file may name, and where they are; nothing else is ever imported for a file."""
 
 MAX_NUMBER = 10**7

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics import compiled_rollout
 from gym_dgpmpc.dynamics.coordinates import Coordinates
@@ -28,6 +27,8 @@ from gym_dgpmpc.dynamics.deep_gp_draws import (
     Refresh,
 )
 from gym_dgpmpc.dynamics.deep_gp_start import initial_model, relocate, restandardise
+from gym_dgpmpc.dynamics.learner import Learner
+from gym_dgpmpc.dynamics.state import take_tensor
 from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
 from gym_dgpmpc.gp.kernels import Kernel, check_kernel
 from gym_dgpmpc.gp.layer import Layer
@@ -67,7 +68,7 @@ class _Standardised(NamedTuple):
         return Data(self.normalisers[0](x), self.normalisers[1](y))
 
 
-class DeepGPDynamics:
+class DeepGPDynamics(Learner[_Fitted]):
     """Implements `DynamicsModel` with a deep Gaussian process of L layers.
 
     Args:
@@ -139,18 +140,15 @@ class DeepGPDynamics:
             raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(DRAWS)}")
         if refresh not in REFRESHES:
             raise ValueError(f"unknown refresh {refresh!r}: expected one of {', '.join(REFRESHES)}")
+        super().__init__(observation_size, action_size, observation_spec, dtype, device)
         self.kernel: Kernel = check_kernel(kernel)
-        self.encoder = Encoder(observation_size, action_size, observation_spec)
         self.num_layers, self.num_inducing, self.num_features = num_layers, num_inducing, num_features
         self.draw_kind, self.refresh = draw, refresh
         self.first_iterations, self.iterations = first_iterations, iterations
         self.num_samples, self.sample_spacing, self.resample_steps = num_samples, sample_spacing, resample_steps
         self.relocate, self.resample_samples = relocate, min(resample_samples, num_samples)
         self.inference = inference or InferenceSettings()
-        self.device = torch.device(device)
-        self.dtype = dtype
         self.compile = compile and dtype == torch.float32 and self.device.type == "cpu"
-        self._fitted: _Fitted | None = None
         self._factors: list[Tensor] = []  # L_z of every layer; derived from the hyperparameters, so not saved
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
@@ -163,8 +161,6 @@ class DeepGPDynamics:
             TrainingError: training diverged however small its steps; the model is as it was.
         """
         x, y = self._encode(data)
-        if x.shape[0] == 0:
-            raise ValueError("cannot fit a dynamics model to 0 transitions")
         normalisers = Normaliser.fit(x), Normaliser.fit(y)
         standardised = Data(normalisers[0](x), normalisers[1](y))
         if self._fitted is None:
@@ -270,11 +266,7 @@ class DeepGPDynamics:
         layer_shapes = ((self.num_inducing, self.encoder.input_size), (self.encoder.input_size,), ())
 
         def take(name: str, *shape: int) -> Tensor:
-            value = state.get(name)
-            received = tuple(value.shape) if isinstance(value, Tensor) else value
-            if not isinstance(value, Tensor) or value.shape != shape:
-                raise ValueError(f"dynamics state {name!r}: expected a tensor of shape {shape}, received {received}")
-            return value.to(self.device, torch.float64).clone()
+            return take_tensor(state, name, shape, self.device)
 
         layers = tuple(
             Layer(
@@ -296,15 +288,6 @@ class DeepGPDynamics:
             )
         self._factors = factorise_all(self.kernel, model)
         self._fitted = _Fitted(model, (inputs, targets), chain, pool, oldest)
-
-    def _encode(self, data: Transitions) -> tuple[Tensor, Tensor]:
-        observation, action, after = (t.to(self.device, torch.float64) for t in data)
-        return self.encoder.inputs(observation, action), self.encoder.targets(observation, after)
-
-    def _require_fit(self, verb: str) -> _Fitted:
-        if self._fitted is None:
-            raise RuntimeError(f"cannot {verb}: the dynamics model has not been fitted to any data yet")
-        return self._fitted
 
     def _diagnostics(self, fitted: _Fitted) -> dict[str, float]:
         """Mixing of the kept samples (medians over coordinates), and the fitted noise and kernel scales."""

@@ -6,7 +6,7 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from gym_dgpmpc import DGPMPCAgent, MPCAgent
+from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent
 from gym_dgpmpc.agents.modelled import ModelledVector
 from gym_dgpmpc.agents.task import Task
 from gym_dgpmpc.data.transitions import TransitionStore
@@ -168,6 +168,37 @@ def test_deep_gp_learns_when_an_episode_ends_and_keeps_it_from_ending():
     # Random actions keep it up for some five steps, the best for twenty.
     assert lengths[:explored].float().mean() < 10
     assert lengths[explored:-1].float().mean() > 15
+
+
+BASELINE = {
+    "num_particles": 5,
+    "horizon": 4,
+    "num_candidates": 20,
+    "num_iterations": 2,
+    "learning_starts": 40,
+    "seed": 0,
+}
+NETWORKS = {"hidden_size": 16, "num_hidden_layers": 1, "weight_decay": (1e-4, 1e-4), "num_epochs": 10}
+
+
+@pytest.mark.parametrize(
+    ("agent_class", "arguments"),
+    [
+        (GPMPCAgent, {"num_inducing": 15, "draw": "DS"}),
+        (GPMPCAgent, {"num_inducing": 15, "draw": "AMM"}),
+        (PETSAgent, {**NETWORKS, "draw": "TS1"}),
+    ],
+)
+def test_every_model_learns_them(agent_class, arguments, tmp_path):
+    learner = agent_class(Balance(), **BASELINE, **arguments).learn(58)
+    assert learner.modelled.reward and learner.modelled.terminated
+    assert (learner.dynamics.encoder.input_size, learner.dynamics.encoder.target_size) == (2, 3)
+    if agent_class is GPMPCAgent:  # which is good at it
+        assert torch.bincount(learner.store.episodes)[-1] > 12
+    learner.save(tmp_path / "agent")
+    loaded = agent_class.load(tmp_path / "agent")
+    expected = learner.predict(np.array([0.1]), deterministic=True)[0]
+    np.testing.assert_array_equal(loaded.predict(np.array([0.1]), deterministic=True)[0], expected)
 
 
 @pytest.mark.parametrize("draw", ["pathwise", "joint"])

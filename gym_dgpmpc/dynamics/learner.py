@@ -1,0 +1,52 @@
+"""What the models that are fitted to encoded transitions have in common: the encoding, and being fitted or not."""
+
+from typing import Generic, TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gym_dgpmpc.data.encoding import Encoder
+from gym_dgpmpc.types import ObservationSpec, Transitions
+
+Fitted = TypeVar("Fitted")
+
+
+class Learner(Generic[Fitted]):
+    """Base of a `DynamicsModel` that keeps what a fit left in ``_fitted``.
+
+    Args:
+        observation_size: S.
+        action_size: A.
+        observation_spec: how to read the observation.
+        dtype: precision of rollouts.
+        device: where tensors live.
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        observation_spec: ObservationSpec | None,
+        dtype: torch.dtype,
+        device: torch.device | str,
+    ):
+        self.encoder = Encoder(observation_size, action_size, observation_spec)
+        self.dtype, self.device = dtype, torch.device(device)
+        self._fitted: Fitted | None = None
+
+    def _encode(self, data: Transitions) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N T"]]:
+        """Inputs and targets, in raw units and double precision.
+
+        Raises:
+            ValueError: there are no transitions.
+        """
+        if len(data.observation) == 0:
+            raise ValueError("cannot fit a dynamics model to 0 transitions")
+        observation, action, after = (t.to(self.device, torch.float64) for t in data)
+        return self.encoder.inputs(observation, action), self.encoder.targets(observation, after)
+
+    def _require_fit(self, verb: str) -> Fitted:
+        if self._fitted is None:
+            raise RuntimeError(f"cannot {verb}: the dynamics model has not been fitted to any data yet")
+        return self._fitted

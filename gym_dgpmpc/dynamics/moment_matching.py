@@ -1,0 +1,149 @@
+"""The draw `AMM`: a candidate's belief is a Gaussian, moved through the Gaussian process by its exact moments.
+
+The propagation of PILCO (Deisenroth and Rasmussen 2011), with full covariances, and with the sines and cosines of
+angles matched exactly too. Between two steps the particles of a candidate stand for its Gaussian: they are placed so
+that their mean and their (population) covariance are exactly its own, and the next step reads those off again. So a
+`TransitionSampler` needs no memory, and the reward is averaged over points spread like the belief.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gym_dgpmpc.data.encoding import Encoder
+from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.gp.moments import Predictor, predicted_moments
+
+
+class Encoded(NamedTuple):
+    """Moments of the encoded inputs x of a Gaussian state s under a known action."""
+
+    mean: Float[Tensor, "K D"]
+    covariance: Float[Tensor, "K D D"]
+    cross: Float[Tensor, "K S D"]  # Cov[s, x]
+
+
+def encoded_moments(
+    encoder: Encoder, mean: Float[Tensor, "K S"], covariance: Float[Tensor, "K S S"], action: Float[Tensor, "K A"]
+) -> Encoded:
+    """Exact moments of the plain dimensions, the sines and cosines of angles, and the action, in the encoder's order.
+
+    For theta ~ N(m, v): E[sin theta] = exp(-v/2) sin m, E[cos theta] = exp(-v/2) cos m, products by the addition
+    theorems, and by Stein's lemma Cov[s, sin theta] = Cov[s, theta] E[cos theta] (for the cosine: -E[sin theta]).
+    """
+    plain, angles = encoder.plain, encoder.angles
+    centre, own = mean[:, angles], covariance[:, angles][:, :, angles]
+    spread = own.diagonal(dim1=-2, dim2=-1)
+    damping = torch.exp(-0.5 * spread)
+    sine, cosine = damping * centre.sin(), damping * centre.cos()
+
+    # E[exp(i (a - b))] and E[exp(i (a + b))] give the second moments of sines and cosines.
+    together = -0.5 * (spread.unsqueeze(-1) + spread.unsqueeze(-2))
+    apart, joined = torch.exp(together + own), torch.exp(together - own)
+    minus, plus = centre.unsqueeze(-1) - centre.unsqueeze(-2), centre.unsqueeze(-1) + centre.unsqueeze(-2)
+    cos_minus, cos_plus = apart * minus.cos(), joined * plus.cos()
+    sin_minus, sin_plus = apart * minus.sin(), joined * plus.sin()
+    mixed = 0.5 * (sin_plus + sin_minus)  # E[sin a cos b]
+    second = torch.cat(
+        [
+            torch.cat([0.5 * (cos_minus - cos_plus), mixed], -1),
+            torch.cat([mixed.mT, 0.5 * (cos_minus + cos_plus)], -1),
+        ],
+        -2,
+    )
+    waves = torch.cat([sine, cosine], -1)
+    to_angles = covariance[:, :, angles]
+    cross_waves = torch.cat([to_angles * cosine.unsqueeze(1), -to_angles * sine.unsqueeze(1)], -1)
+
+    known = mean.new_zeros(len(mean), mean.shape[1], action.shape[1])
+    cross = torch.cat([covariance[:, :, plain], cross_waves, known], -1)
+    size, first, last = encoder.input_size, len(plain), len(plain) + waves.shape[1]
+    joint = mean.new_zeros(len(mean), size, size)
+    joint[:, :first] = cross[:, plain]
+    joint[:, :, :first] = cross[:, plain].mT
+    joint[:, first:last, first:last] = second - waves.unsqueeze(-1) * waves.unsqueeze(-2)
+    return Encoded(torch.cat([mean[:, plain], waves, action], -1), joint, cross)
+
+
+class MomentMatchingSampler:
+    """Moves each candidate's Gaussian one step, and spreads the particles by it.
+
+    Args:
+        predictor: the trained functions, from standardised inputs to standardised targets.
+        encoder: what is fed and predicted.
+        inputs, targets: standardisation of both.
+        noise_variance: added to the (standardised) targets' variance.
+        num_particles: P, at least S + 1: fewer points cannot have a covariance of full rank.
+        generator: for the directions in which the particles are spread, drawn once.
+
+    Raises:
+        ValueError: there are too few particles.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        encoder: Encoder,
+        inputs: Normaliser,
+        targets: Normaliser,
+        noise_variance: Float[Tensor, "T"],
+        num_particles: int,
+        generator: torch.Generator,
+    ):
+        size = encoder.observation_size
+        if num_particles <= size:
+            raise ValueError(
+                f"the draw AMM stands for the Gaussian of {size} numbers by particles: it needs at least {size + 1} of "
+                f"them, received {num_particles}"
+            )
+        self._predictor, self._encoder, self._inputs, self._targets = predictor, encoder, inputs, targets
+        self._noise = noise_variance
+        self._frame = orthonormal_frame(num_particles, size, generator).to(inputs.mean)
+        carried = torch.ones(size, dtype=inputs.mean.dtype, device=inputs.mean.device)
+        carried[[i for i in encoder.spec.absolute if i not in encoder.spec.constant]] = 0.0
+        self._carried = carried
+
+    @torch.no_grad()
+    def __call__(
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
+    ) -> Float[Tensor, "P K S"]:
+        states = observation.to(self._frame.dtype)
+        mean = states.mean(0)
+        deviation = (states - mean).transpose(0, 1)
+        mean, covariance = self.propagate(mean, deviation.mT @ deviation / len(states), action.to(states))
+        values, vectors = torch.linalg.eigh(covariance)
+        root = vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)  # rounding leaves values below zero
+        spread = torch.einsum("ps,kts->pkt", self._frame, root)
+        return (mean + spread).to(observation.dtype)
+
+    def propagate(
+        self, mean: Float[Tensor, "K S"], covariance: Float[Tensor, "K S S"], action: Float[Tensor, "K A"]
+    ) -> tuple[Float[Tensor, "K S"], Float[Tensor, "K S S"]]:
+        """Mean and covariance of the next state: of c s + E f, with c the dimensions that f only changes."""
+        encoded = encoded_moments(self._encoder, mean, covariance, action)
+        scale, predicted = self._inputs.std, self._encoder.predicted
+        output = predicted_moments(
+            self._predictor, self._inputs(encoded.mean), encoded.covariance / (scale.unsqueeze(-1) * scale)
+        )
+        cross = (encoded.cross / scale) @ output.gain * self._targets.std  # Cov[s, f], "K S T"
+        spread = self._targets.std.unsqueeze(-1) * self._targets.std
+        change = spread * (output.covariance + torch.diag(self._noise))
+
+        next_mean, next_covariance = self._carried * mean, covariance * self._carried.unsqueeze(-1) * self._carried
+        next_mean[:, predicted] += self._targets.inverse(output.mean)
+        across = torch.zeros_like(covariance)
+        across[:, :, predicted] = self._carried.unsqueeze(-1) * cross
+        next_covariance = next_covariance + across + across.mT
+        rows = torch.tensor(predicted, device=mean.device)
+        next_covariance[:, rows.unsqueeze(-1), rows] += change
+        return next_mean, 0.5 * (next_covariance + next_covariance.mT)
+
+
+def orthonormal_frame(num_particles: int, size: int, generator: torch.Generator) -> Float[Tensor, "P S"]:
+    """P points with mean zero and population covariance I exactly, in directions drawn uniformly; P > S."""
+    normals = torch.randn(num_particles, size, generator=generator, dtype=torch.float64, device=generator.device)
+    columns = torch.cat([torch.ones_like(normals[:, :1]), normals], 1)
+    basis, _ = torch.linalg.qr(columns)
+    return num_particles**0.5 * basis[:, 1:]

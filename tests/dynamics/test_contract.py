@@ -1,0 +1,293 @@
+"""What every dynamics model and every draw must do; a new one is one more entry of FAMILIES.
+
+The system is linear with Gaussian noise (`tests/oracles/slider.py`), so that what a rollout must give is known.
+"""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.dynamics.ensemble import EnsembleDynamics
+from gym_dgpmpc.dynamics.ensemble_draws import PROPAGATIONS
+from gym_dgpmpc.dynamics.sparse_gp import GP_DRAWS, SparseGPDynamics
+from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
+from gym_dgpmpc.planning.rollout import rollout
+from gym_dgpmpc.types import DynamicsModel, TransitionSampler
+from tests.oracles import linear_gaussian, slider
+from tests.oracles.models import seeded
+
+NOISE = 0.02  # standard deviation of a step
+NUM_DATA = 150
+START = torch.tensor([0.3, -0.5, slider.CONSTANT])
+HORIZON, CANDIDATES, PARTICLES = 4, 3, 10  # a multiple of the networks, more than the observation's numbers
+
+DEEP = {
+    "kernel": "rbf", "num_inducing": 24, "num_features": 512, "first_iterations": 300, "iterations": 2,
+    "num_samples": 20, "sample_spacing": 2, "resample_steps": 2,
+}  # fmt: skip
+NETWORKS = {"num_members": 5, "num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4)}
+
+
+class Case(NamedTuple):
+    """One draw of one model: how it is made, whose training it shares, and what kind of answer it gives."""
+
+    family: str
+    make: functools.partial
+    is_random: bool = True
+
+
+def _cases():
+    def of(family, model, settings, *arguments, **options):
+        return Case(family, functools.partial(model, *arguments, **settings), **options)
+
+    shape = (3, 1, slider.SPEC)
+    cases = {}
+    for draw in PROPAGATIONS:
+        settings = {**NETWORKS, "draw": draw}
+        cases[f"ensemble-{draw}"] = of("ensemble", EnsembleDynamics, settings, *shape, is_random=draw != "expectation")
+    for draw in GP_DRAWS:
+        cases[f"sparse-{draw}"] = of("sparse", SparseGPDynamics, {"num_inducing": 30, "draw": draw}, *shape)
+    cases["exact-DS"] = of("exact", SparseGPDynamics, {"exact": True, "draw": "DS"}, *shape)
+    matern = {"num_inducing": 30, "kernel": "matern52", "draw": "MM"}
+    cases["sparse-matern52-MM"] = of("sparse-matern52", SparseGPDynamics, matern, *shape)
+    for layers in (1, 2):
+        for draw, refresh in (("pathwise", "step"), ("pathwise", "plan"), ("joint", "step"), ("marginal", "step")):
+            settings = {**DEEP, "num_layers": layers, "draw": draw, "refresh": refresh}
+            name = f"deep{layers}-{draw}-{refresh}"
+            cases[name] = of(f"deep{layers}", DeepGPDynamics, settings, *shape)
+    cases["truth"] = Case("truth", functools.partial(lambda: TrueDynamics(slider.environment())), is_random=False)
+    return cases
+
+
+CASES = _cases()
+FAMILIES = {case.family: name for name, case in CASES.items()}  # one case of each
+LEARNERS = [name for family, name in FAMILIES.items() if family != "truth"]
+
+
+@functools.cache
+def trained_state(family):
+    """What the family's training leaves; its draws share it."""
+    model = CASES[FAMILIES[family]].make()
+    model.fit(slider.transitions(NUM_DATA, NOISE), seeded())
+    return model.state_dict()
+
+
+def fitted(name):
+    model = CASES[name].make()
+    model.load_state_dict(trained_state(CASES[name].family))
+    return model
+
+
+def actions():
+    return torch.rand(CANDIDATES, HORIZON, 1, generator=seeded(1)) * 2 - 1
+
+
+def states_of(model, seed=5, num_particles=PARTICLES):
+    sampler = model.draw(num_particles, HORIZON, seeded(seed))
+    assert isinstance(sampler, TransitionSampler)
+    return rollout(sampler, START, actions(), num_particles)
+
+
+def same_states(one, other):
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        assert torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name], name
+
+
+@pytest.fixture(params=CASES)
+def name(request):
+    return request.param
+
+
+@pytest.fixture(params=LEARNERS)
+def learner(request):
+    return request.param
+
+
+def test_it_is_a_dynamics_model(name):
+    assert isinstance(CASES[name].make(), DynamicsModel)
+
+
+def test_rollouts_have_the_states_shape_and_are_finite(name):
+    states = states_of(fitted(name))
+    assert states.shape == (HORIZON + 1, PARTICLES, CANDIDATES, 3) and states.dtype == torch.float32
+    assert states.isfinite().all()
+    assert torch.equal(states[..., 2], torch.full_like(states[..., 2], slider.CONSTANT)), "a constant passes through"
+
+
+def test_the_generator_decides_everything(name):
+    model = fitted(name)
+    torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    first, again, other = states_of(model, 5), states_of(model, 5), states_of(model, 6)
+    assert torch.equal(first, again)
+    assert torch.equal(first, other) != CASES[name].is_random
+    assert torch.equal(torch.get_rng_state(), torch_state)
+    assert np.array_equal(np.random.get_state()[1], numpy_state)  # noqa: NPY002
+
+
+def test_a_draw_leaves_the_model_and_other_draws_alone(name):
+    model = fitted(name)
+    before = {
+        key: value.clone() if isinstance(value, torch.Tensor) else value for key, value in model.state_dict().items()
+    }
+    sampler = model.draw(PARTICLES, HORIZON, seeded(5))
+    states_of(model, 7)  # another draw, made and used in between
+    assert torch.equal(rollout(sampler, START, actions(), PARTICLES), states_of(model, 5))
+    same_states(before, model.state_dict())
+
+
+def test_what_is_saved_predicts_and_learns_on_alike(name):
+    model = fitted(name)
+    loaded = CASES[name].make()
+    loaded.load_state_dict(model.state_dict())
+    assert all(isinstance(value, torch.Tensor | int | float | str) for value in model.state_dict().values())
+    assert torch.equal(states_of(model), states_of(loaded))
+    if name not in LEARNERS:
+        return
+    more = slider.transitions(NUM_DATA + 20, NOISE)
+    for each in (model, loaded):
+        generator = seeded(3)
+        each.resample(more, generator)
+        each.fit(more, generator)
+    same_states(model.state_dict(), loaded.state_dict())
+    assert torch.equal(states_of(model), states_of(loaded))
+
+
+def test_an_empty_state_is_an_untrained_model(learner):
+    model = fitted(learner)
+    model.load_state_dict({})
+    assert model.state_dict() == {}
+    with pytest.raises(RuntimeError, match="cannot draw: the dynamics model has not been fitted"):
+        model.draw(PARTICLES, HORIZON, seeded())
+    with pytest.raises(RuntimeError, match="cannot resample: the dynamics model has not been fitted"):
+        model.resample(slider.transitions(5, NOISE), seeded())
+
+
+def test_a_state_with_a_hole_is_refused_and_changes_nothing(learner):
+    model = fitted(learner)
+    before = states_of(model)
+    for missing in model.state_dict():
+        state = dict(model.state_dict())
+        del state[missing]
+        with pytest.raises(ValueError, match=f"'{missing}'.*received None"):
+            model.load_state_dict(state)
+    assert torch.equal(states_of(model), before)
+
+
+def test_nothing_to_learn_from_is_an_error(learner):
+    with pytest.raises(ValueError, match="0 transitions"):
+        CASES[learner].make().fit(slider.transitions(0, NOISE), seeded())
+
+
+def test_training_is_decided_by_its_generator(learner):
+    def run(seed):
+        torch.manual_seed(seed)  # nobody's business
+        model = fitted(learner)
+        metrics = model.fit(slider.transitions(40, NOISE), seeded(2))
+        assert metrics and all(isinstance(value, float) and value == value for value in metrics.values())
+        return model.state_dict()
+
+    same_states(run(0), run(1))
+
+
+def known_moments(candidate, noise_std):
+    """Mean [H + 1, S] and covariance [H + 1, S, S] of the states under one candidate's actions."""
+    W = np.diag([noise_std**2, noise_std**2, 0.0])
+    return linear_gaussian.moments(slider.A, slider.B, W, START.double().numpy(), actions()[candidate].double().numpy())
+
+
+def test_the_true_dynamics_are_the_linear_system():
+    states = states_of(fitted("truth"), num_particles=2).numpy()
+    for k in range(CANDIDATES):
+        mean, _ = known_moments(k, 0.0)
+        np.testing.assert_allclose(states[:, :, k], np.repeat(mean[:, None], 2, 1), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.family not in ("truth", "ensemble")])
+def test_a_gaussian_process_finds_the_linear_system(name):
+    """None of them draws the noise, so only the function's uncertainty is left, which is less than a step's noise:
+    the variance of a fit with p degrees of freedom is on average p / N of the noise's, and p is far below N here.
+
+    Every step adds the error of one step, at most five of those standard deviations, to what the linear system makes
+    of the errors before it.
+    """
+    num_particles = 200
+    states = states_of(fitted(name), num_particles=num_particles).double().numpy()
+    for k in range(CANDIDATES):
+        mean, _ = known_moments(k, 0.0)
+        spread = states[1, :, k].std(0)
+        assert (spread[:2] < NOISE).all()
+        bound = np.zeros(3)
+        for t in range(1, HORIZON + 1):
+            bound = np.abs(slider.A) @ bound + 5 * spread * (1 + num_particles**-0.5) + 1e-6
+            error = np.abs(states[t, :, k].mean(0) - mean[t])
+            assert (error <= bound).all(), (t, error, bound)
+
+
+def linear_ensemble(draw, num_members=5):
+    """An ensemble that is exactly the linear system with its noise: swish(x) - swish(-x) = x."""
+    model = EnsembleDynamics(
+        3, 1, slider.SPEC, num_members=num_members, num_hidden_layers=1, hidden_size=8, weight_decay=(0, 0), draw=draw
+    )
+    model.fit(slider.transitions(4, NOISE), seeded())  # for a state of the right shapes
+    state = dict(model.state_dict())
+    effect = torch.tensor(np.hstack([slider.A - np.eye(3), slider.B])[:2].T, dtype=torch.float32)  # of (s, a): "4 2"
+    both = torch.cat([torch.eye(4), -torch.eye(4)], 1)
+    mean = torch.cat([effect, -effect])
+    log_variance = torch.tensor([0.0, 0.0, 2 * np.log(NOISE), 2 * np.log(NOISE)], dtype=torch.float32)
+    state |= {
+        "inputs.mean": torch.zeros(4), "inputs.std": torch.ones(4),
+        "layers.0.weight": both.expand(num_members, -1, -1), "layers.0.bias": torch.zeros(num_members, 1, 8),
+        "layers.1.weight": torch.cat([mean, torch.zeros(8, 2)], 1).expand(num_members, -1, -1),
+        "layers.1.bias": log_variance.expand(num_members, 1, -1),
+        "max_logvar": torch.full((2,), 20.0), "min_logvar": torch.full((2,), -40.0),
+    }  # fmt: skip
+    model.load_state_dict(state)
+    return model
+
+
+@pytest.mark.parametrize("draw", ["TS1", "TSinf", "DS"])
+def test_particles_of_a_linear_ensemble_follow_the_kalman_recursion(draw):
+    """Within five standard errors: of a mean sqrt(C_ii / P), of a covariance sqrt((C_ii C_jj + C_ij^2) / P)."""
+    num_particles = 5000
+    states = states_of(linear_ensemble(draw), num_particles=num_particles).double().numpy()
+    for k in range(CANDIDATES):
+        mean, covariance = known_moments(k, NOISE)
+        for t in range(1, HORIZON + 1):
+            own = np.diag(covariance[t])
+            error = np.abs(states[t, :, k].mean(0) - mean[t])
+            assert (error <= 5 * np.sqrt(own / num_particles) + 1e-6).all()
+            standard_error = np.sqrt((np.outer(own, own) + covariance[t] ** 2) / num_particles)
+            assert (np.abs(np.cov(states[t, :, k].T) - covariance[t]) <= 5 * standard_error + 1e-9).all()
+
+
+def test_moment_matching_forgets_correlations_and_nothing_else():
+    """The recursion of the diagonal: C <- diag(A C A^T + W). Each step estimates moments and draws from them, so the
+    estimates' errors add up over the steps."""
+    num_particles = 5000
+    states = states_of(linear_ensemble("MM"), num_particles=num_particles).double().numpy()
+    for k in range(CANDIDATES):
+        mean, _ = known_moments(k, NOISE)
+        variance = np.zeros(3)
+        for t in range(1, HORIZON + 1):
+            variance = slider.A**2 @ variance + np.array([NOISE**2, NOISE**2, 0.0])
+            error = np.abs(states[t, :, k].mean(0) - mean[t])
+            assert (error <= 5 * np.sqrt(2 * t * variance / num_particles) + 1e-6).all()
+            found = states[t, :, k].var(0)
+            assert (np.abs(found - variance) <= 5 * variance * np.sqrt(2 * 2 * t / num_particles) + 1e-9).all()
+
+
+def test_the_expectation_is_the_mean_and_every_particle_the_same():
+    states = states_of(linear_ensemble("expectation"), num_particles=2).numpy()
+    for k in range(CANDIDATES):
+        mean, _ = known_moments(k, 0.0)
+        np.testing.assert_allclose(states[:, :, k], np.repeat(mean[:, None], 2, 1), atol=1e-5)
+
+
+def test_with_one_member_it_does_not_matter_when_it_is_chosen():
+    every_step, once = (linear_ensemble(draw, num_members=1) for draw in ("TS1", "TSinf"))
+    assert torch.equal(states_of(every_step, num_particles=7), states_of(once, num_particles=7))
