@@ -1,5 +1,6 @@
 """Gymnasium-Robotics' goal environments with the MuJoCo at hand; skipped where the package is not installed."""
 
+import importlib
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -12,7 +13,8 @@ from gym_dgpmpc import DGPMPCAgent
 from gym_dgpmpc.agents.task import environment_id, find_observation_spec, find_task, wrapped_env
 from gym_dgpmpc.types import ObservationSpec
 
-robotics = pytest.importorskip("gym_dgpmpc.envs.robotics", exc_type=ImportError)
+pytest.importorskip("gymnasium_robotics")
+robotics = importlib.import_module("gym_dgpmpc.envs.robotics")
 
 PREFIX = "gym_dgpmpc.envs.robotics:"
 

@@ -126,7 +126,7 @@ def check_action(case, action):
 
 
 def outcome(case):
-    """ "actions", or the names of the errors that stopped learning and predicting.
+    """ "actions", or the names of the errors that stopped learning and predicting, or a refusal of the reward.
 
     Raises:
         AssertionError: an action was not finite, or out of bounds.
@@ -134,7 +134,11 @@ def outcome(case):
     """
     env = Scripted(case)
     told = []
-    agent = DGPMPCAgent(env, **case.settings)
+    try:
+        agent = DGPMPCAgent(env, **case.settings)
+    except ValueError as error:
+        assert np.isnan(case.reward_scale) and "reward_fn must return finite numbers" in str(error), error
+        return "refused when the agent is made"
     while len(told) < 4:
         try:
             agent.learn(max(STEPS - env.time, 1), reset_num_timesteps=False)
