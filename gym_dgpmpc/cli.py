@@ -276,7 +276,7 @@ def _prepare_video(env_id: str) -> str:
 
 def _make(env_id: str, *, render: bool) -> gymnasium.Env:
     try:
-        return gymnasium.make(env_id, **({"render_mode": "rgb_array"} if render else {}))  # which not every one takes
+        return gymnasium.make(env_id, render_mode="rgb_array") if render else gymnasium.make(env_id)
     except ModuleNotFoundError as error:
         raise ValueError(f"the environment {env_id} needs the Python module {error.name}, which is missing") from error
 
