@@ -54,9 +54,15 @@ def main() -> None:
         work(arguments)
         return
     rows, load = [], os.getloadavg()[0]
+    deepest, first = max(arguments.layers), arguments.threads[0]
     for threads, name, part, layers in product(arguments.threads, arguments.cases, arguments.parts, arguments.layers):
-        # How cost grows is the same question for every task and number of threads.
-        if part == "scaling" and (threads, name) != (arguments.threads[0], arguments.cases[0]):
+        wanted = {
+            "pets": layers == deepest,  # these networks have layers of their own
+            "inductor": layers == deepest and threads == first,
+            "scaling": (threads, name) == (first, arguments.cases[0]) and layers == min(2, deepest),
+        }
+        # More threads are compared where most is to be done.
+        if not wanted.get(part, threads == first or layers == deepest):
             continue
         command = [
             sys.executable, "-m", "benchmarks.speed", "--worker", part, "--cases", name, "--layers", str(layers),

@@ -39,6 +39,7 @@ class GPMPCAgent(MPCAgent):
         num_iterations: the most iterations of a plan.
         actions_per_plan: actions performed of each plan before the next one is made.
         learning_starts: environment steps of uniform random actions; default: those of one episode.
+        time_budget: seconds that a plan may take, or None; see `MPCAgent`.
         reward_fn: r(s, a, s'), batched over leading dimensions, in torch; default: the environment's ``reward_fn``.
         terminated_fn: whether an episode ends in s', batched likewise; default: the environment's ``terminated_fn``.
         observation_spec: how the model reads observations; default: the environment's ``observation_spec``.
@@ -89,6 +90,7 @@ class GPMPCAgent(MPCAgent):
         num_iterations: int = 5,
         actions_per_plan: int = 1,
         learning_starts: int | None = None,
+        time_budget: float | None = None,
         reward_fn: RewardFn | None = None,
         terminated_fn: TerminatedFn | None = None,
         observation_spec: ObservationSpec | None = None,
@@ -112,6 +114,7 @@ class GPMPCAgent(MPCAgent):
             num_particles=num_particles,
             actions_per_plan=actions_per_plan,
             learning_starts=learning_starts,
+            time_budget=time_budget,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
