@@ -1,7 +1,8 @@
 """`python -m benchmarks.speed`: plans and training at the sizes of the paper's three tasks, beside their peers.
 
 Each worker is a process of its own, so that its threads and its peak memory are its own. Writes `speed.json` and
-`speed.md`. Compare figures of one run only, and of an idle machine.
+`speed.md`. Needs GPyTorch (`pip install -c constraints.txt -e ".[bench]"`). Compare figures of one run only, and of an
+idle machine.
 """
 
 import argparse
