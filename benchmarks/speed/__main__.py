@@ -1,7 +1,8 @@
 """`python -m benchmarks.speed`: plans and training at the sizes of the paper's three tasks, beside their peers.
 
 Each worker is a process of its own, so that its threads and its peak memory are its own. Writes `speed.json` and
-`speed.md`. Compare figures of one run only, and of an idle machine.
+`speed.md`. Needs GPyTorch (`pip install -c constraints.txt -e ".[bench]"`). Compare figures of one run only, and of an
+idle machine.
 """
 
 import argparse
@@ -54,9 +55,15 @@ def main() -> None:
         work(arguments)
         return
     rows, load = [], os.getloadavg()[0]
+    deepest, first = max(arguments.layers), arguments.threads[0]
     for threads, name, part, layers in product(arguments.threads, arguments.cases, arguments.parts, arguments.layers):
-        # How cost grows is the same question for every task and number of threads.
-        if part == "scaling" and (threads, name) != (arguments.threads[0], arguments.cases[0]):
+        wanted = {
+            "pets": layers == deepest,  # these networks have layers of their own
+            "inductor": layers == deepest and threads == first,
+            "scaling": (threads, name) == (first, arguments.cases[0]) and layers == min(2, deepest),
+        }
+        # More threads are compared where most is to be done.
+        if not wanted.get(part, threads == first or layers == deepest):
             continue
         command = [
             sys.executable, "-m", "benchmarks.speed", "--worker", part, "--cases", name, "--layers", str(layers),

@@ -62,6 +62,11 @@ def plans(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
     yield bare | timed(floor.bare_step(case, num_layers), repeats, steps)
     predict = peers.gpytorch_calls(case, num_layers)["prediction"]
     yield {"what": "rollout step", "how": "GPyTorch"} | timed(predict, repeats)
+
+
+def pets(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
+    """A plan through PETS's networks; ``num_layers`` is only that of the deep GP that they stand beside."""
+    data = transitions(case, NUM_TRANSITIONS)
     for how, settings in (("PETS, float32", {}), ("PETS, bfloat16 inside", {"half_precision": True})):
         yield {"what": "plan", "how": how} | timed(peers.pets_plan(case, data, **settings), repeats)
 
@@ -152,4 +157,6 @@ def scaling(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
         yield {"what": "extra memory, MB"} | varied | {"p50_ms": peak_memory_mb() - before, "repeats": 1}
 
 
-WORKERS = {"plans": plans, "training": training, "parts": parts, "inductor": inductor, "scaling": scaling}
+WORKERS = {
+    "plans": plans, "pets": pets, "training": training, "parts": parts, "inductor": inductor, "scaling": scaling,
+}  # fmt: skip

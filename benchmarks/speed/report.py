@@ -93,6 +93,7 @@ def document(facts: Row, rows: list[Row]) -> str:
     ]
     titles = {
         "plans": "Plans and rollout steps",
+        "pets": "Plans by PETS",
         "training": "Training",
         "parts": "Where a plan's time goes",
         "inductor": "By `torch.compile` instead",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gym_dgpmpc.envs.mujoco_task import MujocoTask, not_negative
+from gym_dgpmpc.envs.simulator import SimulatorLayout
 from gym_dgpmpc.types import ObservationSpec
 from gym_dgpmpc.wrappers.risk_sensitive import RiskSensitiveReward
 
@@ -174,6 +175,9 @@ class VelocityHalfCheetahEnv(MujocoTask, utils.EzPickle):
             camera=CAMERA,
             camera_name="follow",
         )
+
+    simulator_layout = SimulatorLayout((None, *range(1, 9)), tuple(range(9, 18)), rates=((VELOCITY, 0),))
+    """Where the observation holds the simulator's state. How far the cheetah ran is not in it and does not matter."""
 
     @property
     def observation_spec(self) -> ObservationSpec:

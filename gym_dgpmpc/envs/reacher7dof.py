@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gym_dgpmpc.envs.mujoco_task import MujocoTask, not_negative, point, whole
+from gym_dgpmpc.envs.simulator import SimulatorLayout
 from gym_dgpmpc.types import ObservationSpec
 
 MAX_ACTION = 20.0
@@ -209,6 +210,9 @@ class Reacher7DoFEnv(MujocoTask, utils.EzPickle):
             height=height,
             camera=CAMERA,
         )
+
+    simulator_layout = SimulatorLayout(tuple(range(7)), tuple(range(10, 17)))
+    """Where the observation holds the simulator's state."""
 
     @property
     def observation_spec(self) -> ObservationSpec:

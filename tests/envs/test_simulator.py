@@ -25,6 +25,20 @@ def test_trajectories_are_those_of_the_environment(name):
     np.testing.assert_allclose(found, stepped, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("name", "tolerance"), [("Reacher7DoF-v0", 1e-9), ("BiasedReacher-v0", 1e-9), ("RiskSensitiveHalfCheetah-v0", 1e-4)]
+)
+def test_the_other_tasks_of_the_paper_say_where_their_state_is(name, tolerance):
+    """The cheetah's contacts are solved to a tolerance, from a start that a trajectory does not share with it."""
+    env = gymnasium.make(name)
+    observation, _ = env.reset(seed=3)
+    bound = env.action_space.high
+    actions = np.random.default_rng(0).uniform(-bound, bound, (20, len(bound))).astype(np.float32)
+    found = Simulator(env).trajectories(observation[None], actions[None].astype(float))[0]
+    stepped = np.stack([env.step(action)[0] for action in actions])
+    np.testing.assert_allclose(found, stepped, rtol=0, atol=tolerance)
+
+
 def test_many_trajectories_are_each_its_own_and_leave_the_environment_alone():
     env = gymnasium.make("ModCartPole-v0")
     env.reset(seed=0)
