@@ -103,9 +103,8 @@ def table(found):
     lines = ["| what | tried | lost | minutes | revision |", "|---|---|---|---|---|"]
     for name, section in found.items():
         lost = "nothing" if not section["lost"] else "; ".join(section["lost"])
-        lines.append(
-            f"| {SECTIONS[name][1]} | {section['tried']} | {lost} | {section['minutes']} | {section.get('revision', '')} |"
-        )
+        cells = (SECTIONS[name][1], section["tried"], lost, section["minutes"], section.get("revision", ""))
+        lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines) + "\n"
 
 
