@@ -40,7 +40,7 @@ MAX_NUMBER = 10**7
 MAX_SIZES = {"num_layers": 100, "num_candidates": 10**5, "num_particles": 10**4, "num_features": 10**5}
 MAX_STATES = 10**8
 """Nor the arguments that say how large a plan is, of which H K P states are held at once."""
-MAX_EPISODE_INFOS = 10_000
+MAX_EPISODE_INFOS, MAX_COUNT = 10_000, 1 << 53
 
 COUNTERS = ("num_timesteps", "num_fitted", "_episode_num", "_episode_index", "_explored_episode")
 
@@ -225,7 +225,10 @@ def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True,
             agent.generators.load_state_dict(state["generators"])
         agent.seeds_environment = bool(config["seeds_environment"])
         for name in COUNTERS:
-            setattr(agent, name, type(getattr(agent, name))(config["counters"][name]))
+            count = config["counters"][name]
+            if not isinstance(count, int) or not 0 <= count <= MAX_COUNT:
+                raise CheckpointError(f"the file's counter {name} = {count} is none")
+            setattr(agent, name, type(getattr(agent, name))(count))
         agent.ep_info_buffer = deque(config["episode_infos"], maxlen=agent.stats_window_size)
         agent.ep_success_buffer = deque(config["episode_successes"], maxlen=agent.stats_window_size)
         own = state["agent"]
