@@ -11,13 +11,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.utils import configure_logger
 
 from gym_dgpmpc.agents.base import PlanningAgent
 from gym_dgpmpc.agents.env_state import episode_start
 from gym_dgpmpc.agents.episode import EpisodeRecord
 from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
-from gym_dgpmpc.agents.safeguard import Safeguard, continue_logs
+from gym_dgpmpc.agents.safeguard import Safeguard
+from gym_dgpmpc.agents.saving import pending_logs
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 
 SelfAgent = TypeVar("SelfAgent", bound="MPCAgent")
@@ -65,7 +68,7 @@ class MPCAgent(PlanningAgent):
         self._episode_index = 0  # of the running episode in the store
         self._explored_episode = False  # whether an episode of random actions has ended
         self._pending_logs: list[tuple[str, float, int, Any]] = []  # of a checkpoint, for the logger of `learn`
-        self._log_run: str | None = None  # of a checkpoint: the folder under `tensorboard_log` that it logs in
+        self._log_run: str | None = None  # the folder under `tensorboard_log` that a run with a folder logs in
         self._safeguard: Safeguard | None = None
 
     @property
@@ -149,12 +152,10 @@ class MPCAgent(PlanningAgent):
             if self._safeguard is not None and self._safeguard.goes_on:
                 total_timesteps -= self.num_timesteps if resume else 0
                 reset_num_timesteps = False
-                continue_logs(self, tb_log_name)
+                self._safeguard.continue_logs()
             total_timesteps, callback = self._setup_learn(
                 max(total_timesteps, 0), callback, reset_num_timesteps, tb_log_name, progress_bar
             )
-            if self._safeguard is not None:
-                self._safeguard.begin()
             callback.on_training_start(locals(), globals())
             self._control(total_timesteps, callback, log_interval)
             callback.on_training_end()
@@ -308,15 +309,36 @@ class MPCAgent(PlanningAgent):
         assert self._last_episode_starts is not None
         return bool(self._last_episode_starts[0])
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        # SB3 prints its tables at verbose=1; here that level is one line per episode.
-        verbose, self.verbose = self.verbose, max(self.verbose - 1, 0)
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "MPC",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if not reset_num_timesteps:
+            self._pending_logs = pending_logs(self)  # the next logger is given what this one has not written
+        # The logger comes last, and SB3 makes none where there is one of the user's.
+        makes_logger, self._custom_logger = not self._custom_logger, True
         try:
-            found = super()._setup_learn(*args, **kwargs)
+            found = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         finally:
-            self.verbose = verbose
+            self._custom_logger = not makes_logger
+        if self._safeguard is not None:
+            self._safeguard.begin(tb_log_name)
+        if makes_logger:
+            self._logger = self._new_logger(tb_log_name, reset_num_timesteps)
         for name, value, count, excluded in self._pending_logs:
             self.logger.record(name, value, tuple(excluded or ()))
             self.logger.name_to_count[name] = count
         self._pending_logs = []
         return found
+
+    def _new_logger(self, tb_log_name: str, reset_num_timesteps: bool) -> Logger:
+        """SB3's, in the folder of the run if there is one, else in the next or the newest of that name."""
+        verbose = max(self.verbose - 1, 0)  # SB3 prints its tables at verbose=1; here that level is a line per episode
+        if self._safeguard is None or self.tensorboard_log is None or self._log_run is None:
+            return configure_logger(verbose, self.tensorboard_log, tb_log_name, reset_num_timesteps)
+        formats = ["stdout", "tensorboard"] if verbose else ["tensorboard"]
+        return configure(os.path.join(self.tensorboard_log, self._log_run), formats)

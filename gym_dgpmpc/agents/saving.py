@@ -11,7 +11,7 @@ environment itself, and of a plain `MPCAgent` the objects it was composed of.
 import importlib.metadata
 import inspect
 import math
-import os
+import re
 from collections import deque
 from dataclasses import asdict
 from importlib import import_module
@@ -78,8 +78,8 @@ def collect(agent: Any, *, gives_up: bool = False) -> Checkpoint:
         "space_dtypes": {name: str(box.dtype) for name, box in boxes.items()},
         "counters": {name: getattr(agent, name) for name in COUNTERS},
         "episode": None if start is None else {**start, "goes_on": goes_on},
-        "pending_logs": _pending_logs(agent),
-        "log_run": _log_run(agent),
+        "pending_logs": [(n, _json_number(v), count, e) for n, v, count, e in pending_logs(agent)],
+        "log_run": agent._log_run,
         "episode_infos": [_plain(info) for info in agent.ep_info_buffer or ()][-MAX_EPISODE_INFOS:],
         "episode_successes": [float(success) for success in agent.ep_success_buffer or ()],
         "values": {part: _without_tensors(state) for part, state in tensors.items()},
@@ -237,7 +237,10 @@ def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True,
         if checkpoint.schema > 1:
             agent._record.number = agent._episode_num + 1
             agent._record.load_state_dict({k.removeprefix("record."): v for k, v in own.items() if "record." in k})
-            agent._log_run = config["log_run"]
+            log_run = config["log_run"]
+            if log_run is not None and not re.fullmatch(r"[^./\\][^/\\]{0,200}", log_run):
+                raise CheckpointError(f"the file's log_run = {log_run!r} is no folder's name")
+            agent._log_run = log_run
             agent._pending_logs = [(str(n), _number(v), int(c), e) for n, v, c, e in config["pending_logs"]]
         if not force_reset and "last_observation" in own:
             agent._last_obs = own["last_observation"].numpy()
@@ -270,22 +273,16 @@ def _without_tensors(state: StateDict) -> dict[str, Any]:
     return {name: _json_number(value) for name, value in state.items() if not isinstance(value, Tensor)}
 
 
-def _pending_logs(agent: Any) -> list[tuple[str, Any, int, Any]]:
+def pending_logs(agent: Any) -> list[tuple[str, float, int, Any]]:
     """Numbers that the logger was given since it last wrote: name, value, count of a mean, formats left out."""
     logger = getattr(agent, "_logger", None)
     if logger is None:
         return agent._pending_logs
     return [
-        (name, _json_number(float(value)), logger.name_to_count.get(name, 0), logger.name_to_excluded.get(name))
+        (name, float(value), logger.name_to_count.get(name, 0), logger.name_to_excluded.get(name))
         for name, value in list(logger.name_to_value.items())
         if isinstance(value, int | float | np.number)
     ]
-
-
-def _log_run(agent: Any) -> str | None:
-    """The folder's name, under the agent's ``tensorboard_log``, that it logs in."""
-    logger = getattr(agent, "_logger", None)
-    return agent._log_run if logger is None or agent.tensorboard_log is None else os.path.basename(logger.dir)
 
 
 def _json_number(value: Any) -> Any:
