@@ -11,14 +11,17 @@ from typing import Any, TypeVar
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.utils import configure_logger
 
 from gym_dgpmpc.agents.acting import ActingAgent
 from gym_dgpmpc.agents.episode import EpisodeRecord
 from gym_dgpmpc.agents.reward_guard import disagreements
 from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
 from gym_dgpmpc.agents.running import next_episode
-from gym_dgpmpc.agents.safeguard import Safeguard, continue_logs
+from gym_dgpmpc.agents.safeguard import Safeguard
+from gym_dgpmpc.agents.saving import pending_logs
 from gym_dgpmpc.errors import EnvironmentDataError
 
 SelfAgent = TypeVar("SelfAgent", bound="MPCAgent")
@@ -74,7 +77,7 @@ class MPCAgent(ActingAgent):
     def _setup_model(self) -> None:
         super()._setup_model()
         self._pending_logs: list[tuple[str, float, int, Any]] = []  # of a checkpoint, for the logger of `learn`
-        self._log_run: str | None = None  # of a checkpoint: the folder under `tensorboard_log` that it logs in
+        self._log_run: str | None = None  # the folder under `tensorboard_log` that a run with a folder logs in
         self._safeguard: Safeguard | None = None
         self._has_described = False  # whether it was said where reward and termination come from
 
@@ -154,12 +157,10 @@ class MPCAgent(ActingAgent):
             if self._safeguard is not None and self._safeguard.goes_on:
                 total_timesteps -= self.num_timesteps if resume else 0
                 reset_num_timesteps = False
-                continue_logs(self, tb_log_name)
+                self._safeguard.continue_logs()
             total_timesteps, callback = self._setup_learn(
                 max(total_timesteps, 0), callback, reset_num_timesteps, tb_log_name, progress_bar
             )
-            if self._safeguard is not None:
-                self._safeguard.begin()
             callback.on_training_start(locals(), globals())
             self._control(total_timesteps, callback, log_interval)
             callback.on_training_end()
@@ -246,13 +247,26 @@ class MPCAgent(ActingAgent):
             self.dump_logs()
         callback.on_rollout_end()
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        # SB3 prints its tables at verbose=1; here that level is one line per episode.
-        verbose, self.verbose = self.verbose, max(self.verbose - 1, 0)
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "MPC",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if not reset_num_timesteps:
+            self._pending_logs = pending_logs(self)  # the next logger is given what this one has not written
+        # The logger comes last, and SB3 makes none where there is one of the user's.
+        makes_logger, self._custom_logger = not self._custom_logger, True
         try:
-            found = super()._setup_learn(*args, **kwargs)
+            found = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         finally:
-            self.verbose = verbose
+            self._custom_logger = not makes_logger
+        if self._safeguard is not None:
+            self._safeguard.begin(tb_log_name)
+        if makes_logger:
+            self._logger = self._new_logger(tb_log_name, reset_num_timesteps)
         for name, value, count, excluded in self._pending_logs:
             self.logger.record(name, value, tuple(excluded or ()))
             self.logger.name_to_count[name] = count
@@ -261,3 +275,11 @@ class MPCAgent(ActingAgent):
             print(self.task.describe(can_learn_termination=self.learns_termination), flush=True)
             self._has_described = True
         return found
+
+    def _new_logger(self, tb_log_name: str, reset_num_timesteps: bool) -> Logger:
+        """SB3's, in the folder of the run if there is one, else in the next or the newest of that name."""
+        verbose = max(self.verbose - 1, 0)  # SB3 prints its tables at verbose=1; here that level is a line per episode
+        if self._safeguard is None or self.tensorboard_log is None or self._log_run is None:
+            return configure_logger(verbose, self.tensorboard_log, tb_log_name, reset_num_timesteps)
+        formats = ["stdout", "tensorboard"] if verbose else ["tensorboard"]
+        return configure(os.path.join(self.tensorboard_log, self._log_run), formats)

@@ -93,10 +93,19 @@ class Safeguard:
         """Whether the folder held a run, which the agent goes on with."""
         return self._goes_on
 
-    def begin(self) -> None:
-        """Write the first checkpoint of a run."""
-        if not self._goes_on:
-            self._save()
+    def begin(self, tb_log_name: str) -> None:
+        """Choose where a new run logs, and write its first checkpoint, which says so before there is such a folder."""
+        if self._goes_on:
+            return
+        if self.agent.tensorboard_log is not None:
+            newest = get_latest_run_id(self.agent.tensorboard_log, tb_log_name)
+            self.agent._log_run = f"{tb_log_name}_{newest + 1}"
+        self._save()
+
+    def continue_logs(self) -> None:
+        """Drop what was logged after the checkpoint, for it will be logged again; see `event_files`."""
+        if self.agent.tensorboard_log is not None and self.agent._log_run is not None:
+            drop_events_after(self.agent.num_timesteps, Path(self.agent.tensorboard_log) / self.agent._log_run)
 
     def after_step(self, *, episode_ended: bool) -> None:
         """Write a checkpoint if one is due, and stop if that was asked for.
@@ -143,21 +152,3 @@ def resume_from(agent: Any, checkpoints: RunCheckpoints) -> bool:
     if checkpoint is not None:
         resume_agent(agent, checkpoint)
     return checkpoint is not None
-
-
-def continue_logs(agent: Any, tb_log_name: str) -> None:
-    """Drop what was logged after the agent's checkpoint, for it will be logged again; see `event_files`.
-
-    Stable-Baselines3 goes on in the newest folder of that name: if it is not the run's, nothing is dropped.
-    """
-    if agent.tensorboard_log is None or agent._log_run is None:
-        return
-    newest = f"{tb_log_name}_{get_latest_run_id(agent.tensorboard_log, tb_log_name)}"
-    if newest == agent._log_run:
-        drop_events_after(agent.num_timesteps, Path(agent.tensorboard_log) / newest)
-    elif os.path.isdir(os.path.join(agent.tensorboard_log, agent._log_run)):
-        warnings.warn(
-            f"the run has logged in {agent._log_run}, but {newest} is newer: the curve goes on there",
-            ReliabilityWarning,
-            stacklevel=2,
-        )

@@ -26,7 +26,7 @@ MAX_NUMBER = 10**7
 MAX_SIZES = {"num_layers": 100, "num_candidates": 10**5, "num_particles": 10**4, "num_features": 10**5}
 MAX_STATES = 10**8
 """Nor the arguments that say how large a plan is, of which H K P states are held at once."""
-MAX_ENVS = 10_000
+MAX_ENVS, MAX_COUNT = 10_000, 1 << 53
 
 
 def class_of(checkpoint: Checkpoint, asked: type) -> Any:
@@ -126,6 +126,8 @@ def saved_running(checkpoint: Checkpoint) -> list[dict[str, Any]]:
             {"index": int(episode["index"]), "has_explored": bool(episode["has_explored"])}
             for episode in checkpoint.config["running"]
         ]
+        if not all(-1 <= episode["index"] <= MAX_COUNT for episode in running):
+            raise ValueError(f"their numbers are {[episode['index'] for episode in running]}")
     except Exception as error:
         raise CheckpointError(f"the file does not describe the episodes that were running: {error!r}") from error
     if not 1 <= len(running) <= MAX_ENVS:

@@ -10,7 +10,7 @@ environment itself, and of a plain `MPCAgent` the objects it was composed of.
 
 import importlib.metadata
 import math
-import os
+import re
 from collections import deque
 from dataclasses import asdict
 from typing import Any
@@ -25,7 +25,7 @@ from gym_dgpmpc.agents.dict_observations import layout
 from gym_dgpmpc.agents.env_state import describe_start, options_to_reset, set_options
 from gym_dgpmpc.agents.plan_state import pack, unpack
 from gym_dgpmpc.agents.randomness import derive_seed
-from gym_dgpmpc.agents.saved import asked_to_learn, class_of, saved_arguments, saved_running, saved_spaces
+from gym_dgpmpc.agents.saved import MAX_COUNT, asked_to_learn, class_of, saved_arguments, saved_running, saved_spaces
 from gym_dgpmpc.agents.task import LEARNED, environment_id, wrapped_env
 from gym_dgpmpc.errors import CheckpointError, DGPMPCError, UnknownRewardError
 from gym_dgpmpc.types import ObservationSpec, StateDict
@@ -80,8 +80,8 @@ def collect(agent: Any, *, gives_up: bool = False) -> Checkpoint:
         "running": [{"index": episode.index, "has_explored": episode.has_explored} for episode in running],
         "reset_options": options_to_reset(agent.env, again=True),
         "episode": None if start is None else {**start, "goes_on": goes_on},
-        "pending_logs": _pending_logs(agent),
-        "log_run": _log_run(agent),
+        "pending_logs": [(n, _json_number(v), count, e) for n, v, count, e in pending_logs(agent)],
+        "log_run": agent._log_run,
         "episode_infos": [_plain(info) for info in agent.ep_info_buffer or ()][-MAX_EPISODE_INFOS:],
         "episode_successes": [float(success) for success in agent.ep_success_buffer or ()],
         "values": {part: _without_tensors(state) for part, state in tensors.items()},
@@ -173,13 +173,19 @@ def restore(agent: Any, checkpoint: Checkpoint, *, keep_generators: bool = True,
             agent.generators.load_state_dict(state["generators"])
         agent.seeds_environment = bool(config["seeds_environment"])
         for name in COUNTERS:
-            setattr(agent, name, type(getattr(agent, name))(config["counters"][name]))
+            count = config["counters"][name]
+            if not isinstance(count, int) or not 0 <= count <= MAX_COUNT:
+                raise CheckpointError(f"the file's counter {name} = {count} is none")
+            setattr(agent, name, type(getattr(agent, name))(count))
         agent.ep_info_buffer = deque(config["episode_infos"], maxlen=agent.stats_window_size)
         agent.ep_success_buffer = deque(config["episode_successes"], maxlen=agent.stats_window_size)
         own = state["agent"]
         _restore_running(agent, checkpoint, own)
         if checkpoint.schema > 1:
-            agent._log_run = config.get("log_run")
+            log_run = config.get("log_run")
+            if log_run is not None and not re.fullmatch(r"[^./\\][^/\\]{0,200}", log_run):
+                raise CheckpointError(f"the file's log_run = {log_run!r} is no folder's name")
+            agent._log_run = log_run
             agent._pending_logs = [(str(n), _number(v), int(c), e) for n, v, c, e in config["pending_logs"]]
         if not force_reset and "last_observation" in own and len(own["last_observation"]) == agent.n_envs:
             agent._last_obs = own["last_observation"].numpy()
@@ -231,22 +237,16 @@ def _without_tensors(state: StateDict) -> dict[str, Any]:
     return {name: _json_number(value) for name, value in state.items() if not isinstance(value, Tensor)}
 
 
-def _pending_logs(agent: Any) -> list[tuple[str, Any, int, Any]]:
+def pending_logs(agent: Any) -> list[tuple[str, float, int, Any]]:
     """Numbers that the logger was given since it last wrote: name, value, count of a mean, formats left out."""
     logger = getattr(agent, "_logger", None)
     if logger is None:
         return agent._pending_logs
     return [
-        (name, _json_number(float(value)), logger.name_to_count.get(name, 0), logger.name_to_excluded.get(name))
+        (name, float(value), logger.name_to_count.get(name, 0), logger.name_to_excluded.get(name))
         for name, value in list(logger.name_to_value.items())
         if isinstance(value, int | float | np.number)
     ]
-
-
-def _log_run(agent: Any) -> str | None:
-    """The folder's name, under the agent's ``tensorboard_log``, that it logs in."""
-    logger = getattr(agent, "_logger", None)
-    return agent._log_run if logger is None or agent.tensorboard_log is None else os.path.basename(logger.dir)
 
 
 def _json_number(value: Any) -> Any:

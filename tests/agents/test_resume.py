@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from gym_dgpmpc.agents import run_checkpoints
+from gym_dgpmpc.agents import MPCAgent, run_checkpoints
 from gym_dgpmpc.agents.env_state import generator_states, set_generator_states
 from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
 from gym_dgpmpc.agents.saving import collect
@@ -409,3 +409,29 @@ def test_outside_the_main_thread_there_are_no_signals_to_handle(tmp_path):
     worker.start()
     worker.join()
     assert (tmp_path / "agent.zip").exists()
+
+
+def test_a_run_killed_before_it_has_logged_goes_on_in_the_folder_that_it_had_chosen(whole, tmp_path, monkeypatch):
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    (tmp_path / "logs" / "Other_7").mkdir(parents=True)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(MPCAgent, "_new_logger", killed)
+        train(tmp_path, actions_per_plan=2)
+    train(tmp_path, kill_at=12, actions_per_plan=2)
+    (tmp_path / "logs" / "MPC_2").mkdir()  # of another run, begun in between
+    train(tmp_path, actions_per_plan=2)
+    assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["MPC_1", "MPC_2", "Other_7"]
+    assert list((tmp_path / "logs" / "MPC_2").iterdir()) == []
+    assert_same(whole, tmp_path)
+
+
+def test_what_was_logged_at_the_end_of_a_call_is_written_in_the_next(tmp_path):
+    learner = agent(NoisyPointMass())
+    learner.learn(2 * LENGTH, run_folder=tmp_path / "one")
+    for _ in range(2):
+        learner.learn(0, reset_num_timesteps=False)
+    assert learner.logger.name_to_value["train/num_transitions"] == 2 * LENGTH
+    learner.learn(0, run_folder=tmp_path / "other", reset_num_timesteps=False)
+    assert checkpoint_differences(tmp_path / "one" / "agent.zip", tmp_path / "other" / "agent.zip") == []

@@ -1,6 +1,7 @@
 """`python -m tests.faults`: all faults at full size, two sections at a time; prints and keeps a table.
 
-With `--quick` every section is tried at a small size and nothing is kept.
+What is kept grows with every section that ends; `--only` runs some of them and leaves the results of the others. With
+`--quick` every section is tried at a small size and nothing is kept.
 """
 
 import argparse
@@ -12,8 +13,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
+
+from gym_dgpmpc.agents.files import replace_text
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results" / "reliability"
 PACKAGES = ("gymnasium", "hypothesis", "mujoco", "numpy", "safetensors", "scipy", "stable-baselines3", "torch")
@@ -97,10 +100,11 @@ def run_section(name, quick):
 
 
 def table(found):
-    lines = ["| what | tried | lost | minutes |", "|---|---|---|---|"]
+    lines = ["| what | tried | lost | minutes | revision |", "|---|---|---|---|---|"]
     for name, section in found.items():
         lost = "nothing" if not section["lost"] else "; ".join(section["lost"])
-        lines.append(f"| {SECTIONS[name][1]} | {section['tried']} | {lost} | {section['minutes']} |")
+        cells = (SECTIONS[name][1], section["tried"], lost, section["minutes"], section.get("revision", ""))
+        lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines) + "\n"
 
 
@@ -108,6 +112,7 @@ def main():
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__.split(";")[0])
     parser.add_argument("--quick", action="store_true", help="small sizes; results are not kept")
     parser.add_argument("--section", choices=SECTIONS, help="run this one alone, in this process, and print JSON")
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), help="run these sections alone")
     arguments = parser.parse_args()
     if arguments.section:
         import torch
@@ -118,32 +123,42 @@ def main():
         print(json.dumps({"tried": tried, "lost": lost}))
         return 0
     # The longest first.
-    order = sorted(SECTIONS, key=("cases", "kills", "soak", "mutations", "cuts", "hostile", "disk").index)
+    order = sorted(arguments.only, key=("cases", "kills", "soak", "mutations", "cuts", "hostile", "disk").index)
     with ThreadPoolExecutor(2) as pool:
-        found = dict(zip(order, pool.map(lambda name: run_section(name, arguments.quick), order), strict=True))
-    found = {name: found[name] for name in SECTIONS}
-    print(f"\n{table(found)}")
-    if not arguments.quick:
-        keep(found)
+        running = {pool.submit(run_section, name, arguments.quick): name for name in order}
+        found = {}
+        for ended in as_completed(running):
+            found[running[ended]] = ended.result()
+            if not arguments.quick:
+                keep(running[ended], ended.result())
+    print(f"\n{table({name: found[name] for name in SECTIONS if name in found})}")
     return int(any(section["lost"] for section in found.values()))
 
 
-def keep(found):
-    """Write the table, with what it was made with."""
-    revision = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True).stdout.strip()
-    facts = {
-        "command": "make fault-test",
+def keep(name, section):
+    """Add a section's results to the table, with the revision and the versions that they were made with."""
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    file = RESULTS / "faults.json"
+    kept = json.loads(file.read_text()) if file.exists() else {}
+    revision = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+    kept[name] = {
+        **section,
         "revision": revision or "unknown",
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-        "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+        "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
     }
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / "faults.json").write_text(json.dumps({**facts, "sections": found}, indent=1) + "\n")
-    versions = ", ".join(f"{name} {version}" for name, version in facts["versions"].items())
-    text = f"# Faults injected, and what was lost\n\nMade by `make fault-test` at revision {facts['revision']}, with "
-    text += f"Python {facts['python']}, {versions}, on {facts['system']}, shared with other work.\n\n{table(found)}"
-    (RESULTS / "faults.md").write_text(text)
+    replace_text(file, json.dumps(kept, indent=1) + "\n")
+    kept = {name: kept[name] for name in SECTIONS if name in kept}
+    facts = "; ".join(sorted({_told_versions(section) for section in kept.values()}))
+    missing = ", ".join(name for name in SECTIONS if name not in kept)
+    text = f"# Faults injected, and what was lost\n\nMade by `make fault-test`, with {facts}.\n\n{table(kept)}"
+    replace_text(RESULTS / "faults.md", text + (f"\nNot run yet: {missing}.\n" if missing else ""))
+
+
+def _told_versions(section):
+    versions = ", ".join(f"{name} {version}" for name, version in section["versions"].items())
+    return f"Python {section['python']}, {versions}, on {section['system']}"
 
 
 if __name__ == "__main__":
