@@ -36,7 +36,8 @@ def control(agent: DGPMPCAgent, env: gymnasium.Env, seeds: range) -> dict[str, A
             total, done = total + float(reward), terminated or truncated
         returns.append(total)
     p50, p95, p99 = np.quantile(times[2:], [0.5, 0.95, 0.99])  # the first calls warm up
-    return {"returns": returns, "p50_ms": p50, "p95_ms": p95, "p99_ms": p99, "max_ms": max(times[2:])}
+    quantiles = {"p50_ms": p50, "p95_ms": p95, "p99_ms": p99, "max_ms": max(times[2:])}
+    return {"returns": returns} | {name: float(value) for name, value in quantiles.items()}
 
 
 def main() -> None:
