@@ -4,10 +4,10 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from gym_dgpmpc.dynamics.ensemble import EnsembleDynamics
 
 from benchmarks.speed.cases import BATCH_SIZE, NUM_CANDIDATES, NUM_INDUCING, NUM_PARTICLES, Case, plan_call
 from gym_dgpmpc.data.encoding import Encoder
+from gym_dgpmpc.dynamics.ensemble import EnsembleDynamics
 from gym_dgpmpc.types import Transitions
 
 
