@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 from safetensors import SafetensorError
-from safetensors.torch import save as save_tensors
+from safetensors.numpy import save as save_arrays
 from torch import Tensor
 
 from gym_dgpmpc.agents.files import replace_file
@@ -60,9 +60,9 @@ def write_checkpoint(checkpoint: Checkpoint, path: CheckpointPath, previous: Pat
     """
     members = {"config.json": _to_json(checkpoint.config)}
     for name, tensors in checkpoint.tensors.items():
-        # safetensors wants every tensor contiguous and in memory of its own.
-        own = {key: tensor.detach().cpu().clone().contiguous() for key, tensor in tensors.items()}
-        members[f"{name}.safetensors"] = save_tensors(own)
+        # As arrays: for tensors safetensors makes a ctypes type of each size, which Python keeps for ever.
+        arrays = {key: tensor.detach().cpu().contiguous().numpy() for key, tensor in tensors.items()}
+        members[f"{name}.safetensors"] = save_arrays(arrays)
     table = {name: {"bytes": len(data), "sha256": _sha256(data)} for name, data in members.items()}
     members["manifest.json"] = _to_json({"format": FORMAT, "schema": SCHEMA, "members": table})
     if not isinstance(path, str | os.PathLike):

@@ -15,7 +15,7 @@ from tests.faults.kills import TINY
 EPISODE_STEPS = 5
 ROW_BYTES = 200
 """A generous bound on what one step may keep: its row in the store, a copy while that grows, Monitor's sums."""
-ALLOWED_GROWTH = 24 << 20
+ALLOWED_GROWTH = 12 << 20
 ALLOWED_SLOWDOWN = 1.5
 
 
