@@ -27,7 +27,7 @@ from gym_dgpmpc.dynamics.deep_gp_draws import (
     Refresh,
 )
 from gym_dgpmpc.dynamics.deep_gp_start import initial_model, relocate, restandardise
-from gym_dgpmpc.dynamics.learner import Learner
+from gym_dgpmpc.dynamics.learner import Learner, check_counts
 from gym_dgpmpc.dynamics.state import take_tensor
 from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
 from gym_dgpmpc.gp.kernels import Kernel, check_kernel
@@ -122,18 +122,15 @@ class DeepGPDynamics(Learner[_Fitted]):
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ):
-        counts = {
-            "num_layers": num_layers,
-            "num_inducing": num_inducing,
-            "num_features": num_features,
-            "first_iterations": first_iterations,
-            "iterations": iterations,
-            "num_samples": num_samples,
-            "sample_spacing": sample_spacing,
-        }
-        for name, value in counts.items():
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, received {value}")
+        check_counts(
+            num_layers=num_layers,
+            num_inducing=num_inducing,
+            num_features=num_features,
+            first_iterations=first_iterations,
+            iterations=iterations,
+            num_samples=num_samples,
+            sample_spacing=sample_spacing,
+        )
         if resample_steps < 0:
             raise ValueError(f"resample_steps must be at least 0, received {resample_steps}")
         if draw not in DRAWS:

@@ -24,7 +24,7 @@ from gym_dgpmpc.dynamics.ensemble_network import (
     predict,
 )
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
-from gym_dgpmpc.dynamics.learner import Learner
+from gym_dgpmpc.dynamics.learner import Learner, check_counts
 from gym_dgpmpc.dynamics.state import take_tensor
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
@@ -88,16 +88,13 @@ class EnsembleDynamics(Learner[_Fitted]):
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ):
-        counts = {
-            "num_members": num_members,
-            "num_hidden_layers": num_hidden_layers,
-            "hidden_size": hidden_size,
-            "batch_size": batch_size,
-            "num_epochs": num_epochs,
-        }
-        for name, value in counts.items():
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, received {value}")
+        check_counts(
+            num_members=num_members,
+            num_hidden_layers=num_hidden_layers,
+            hidden_size=hidden_size,
+            batch_size=batch_size,
+            num_epochs=num_epochs,
+        )
         if len(weight_decay) != num_hidden_layers + 1 or not all(0 <= decay < math.inf for decay in weight_decay):
             raise ValueError(
                 f"weight_decay must hold one number that is not negative for each of the {num_hidden_layers} hidden "

@@ -16,7 +16,7 @@ from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp_start import NOISE_VARIANCE, restandardise
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
-from gym_dgpmpc.dynamics.learner import Learner
+from gym_dgpmpc.dynamics.learner import Learner, check_counts
 from gym_dgpmpc.dynamics.moment_matching import MomentMatchingSampler
 from gym_dgpmpc.dynamics.state import take_tensor
 from gym_dgpmpc.gp.deep_gp import DeepGP
@@ -84,9 +84,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ):
-        for name, value in {"num_inducing": num_inducing, "max_iterations": max_iterations}.items():
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, received {value}")
+        check_counts(num_inducing=num_inducing, max_iterations=max_iterations)
         if draw not in GP_DRAWS:
             raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(GP_DRAWS)}")
         self.kernel: Kernel = check_kernel(kernel)
