@@ -10,6 +10,7 @@ from numpy import ndarray
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
 from gym_dgpmpc.agents.dict_observations import flatten
+from gym_dgpmpc.agents.task import flat_size
 from gym_dgpmpc.errors import EnvironmentDataError
 
 REQUIRED = ("observation", "action", "next_observation", "reward")
@@ -66,7 +67,7 @@ def read_logged(
             f"Stable-Baselines3 or a Minari dataset, got {type(data).__name__}"
         )
     rows = rows._replace(action=_flat_actions(rows.action, action_space))
-    sizes = {"observation": observation_space.shape, "action": (int(np.prod(action_space.shape)),)}
+    sizes = {"observation": observation_space.shape, "action": (flat_size(action_space),)}
     sizes |= {"next_observation": observation_space.shape, "reward": (), "terminated": (), "episode": ()}
     count = len(rows.action)
     for name, value in rows._asdict().items():
@@ -139,7 +140,7 @@ def _of_buffer(buffer: ReplayBuffer) -> LoggedRows:
 def _flat_actions(action: ndarray, space: spaces.Box) -> ndarray:
     """Actions of the space's shape as vectors; those of any other shape as they are, to be refused."""
     shaped = action.ndim == 1 + len(space.shape) and action.shape[1:] == space.shape
-    return action.reshape(len(action), -1) if shaped else action
+    return action.reshape(len(action), flat_size(space)) if shaped else action
 
 
 def _unscaled(action: Float[ndarray, "n A"], space: spaces.Box, scaled: bool) -> ndarray:
