@@ -21,6 +21,7 @@ LAYERS = (
     {"planning"},
     {"agents"},
     {"reporting"},
+    {"bench"},
     {"__init__"},
     {"options", "cli"},
     {"__main__"},

@@ -1,0 +1,131 @@
+"""One run, one file: what a method did on a task with a seed. The runner writes these files, the report reads them.
+
+All runs lie in one folder, whichever suite asked for them, so that a run that two suites need is done once.
+"""
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from gym_dgpmpc.agents.files import replace_text
+from gym_dgpmpc.errors import DGPMPCError
+
+SCHEMA = 1
+
+Actions = Literal["random", "planned", "policy"]
+
+
+class ResultError(DGPMPCError, ValueError):
+    """A file is not a result of this package, or is damaged."""
+
+
+class Episode(NamedTuple):
+    """One episode that was played."""
+
+    actions: Actions
+    """"random" before the first training, "planned" by a planner, "policy" by a model-free method."""
+    episode_return: float
+    steps: int
+    total_steps: int
+    """Environment steps of the run up to the episode's end, the random ones included."""
+    seconds: float
+    """Wall-clock time since the last episode's end, training included."""
+    success: bool | None = None
+    """Whether the goal was reached in the last step, of tasks that say so in ``info["is_success"]``."""
+
+
+class RunKey(NamedTuple):
+    """What a run is of; there is one file for each."""
+
+    method: str
+    """Such as "DGP-MPC L=2 matern32", "PETS TSinf", "GP-MM", "SAC" or "true dynamics": what a report calls it."""
+    task: str
+    """Id of the environment; what was changed about it, if anything, after a colon: "Pendulum-v1:learned reward"."""
+    seed: int
+
+    @property
+    def file_name(self) -> str:
+        """Letters, digits, dots, dashes and equals signs, so that it is valid on every system."""
+        plain = [re.sub(r"[^A-Za-z0-9.=-]+", "-", part) for part in (self.task, self.method)]
+        return f"{'_'.join(plain)}_seed{self.seed}.json"
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What happened in a run, and with what.
+
+    Attributes:
+        key: method, task and seed.
+        episodes: in the order in which they were played.
+        settings: every argument of the method.
+        milliseconds_per_action: wall-clock time of choosing an action, averaged over the run; None if not measured.
+        started: ISO 8601, UTC.
+        command: that made it.
+        revision: of this package's source, with "-dirty" if it was changed; "unknown" without one.
+        versions: of Python and the packages used.
+        machine: system, processor, cores, threads.
+    """
+
+    key: RunKey
+    episodes: tuple[Episode, ...]
+    settings: Mapping[str, Any]
+    milliseconds_per_action: float | None
+    started: str
+    command: str
+    revision: str
+    versions: Mapping[str, str]
+    machine: Mapping[str, Any]
+
+    @property
+    def counted(self) -> tuple[Episode, ...]:
+        """The episodes that the method answers for: all but those of random actions."""
+        return tuple(episode for episode in self.episodes if episode.actions != "random")
+
+    def write(self, folder: Path) -> Path:
+        """Write the file of this run in ``folder``, whole or not at all.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        content = {"schema": SCHEMA, **asdict(self), "key": self.key._asdict()}
+        content["episodes"] = [episode._asdict() for episode in self.episodes]
+        path = folder / self.key.file_name
+        replace_text(path, json.dumps(content, indent=1) + "\n")
+        return path
+
+    @classmethod
+    def read(cls, path: Path) -> "RunResult":
+        """The result in a file.
+
+        Raises:
+            ResultError: the file is none, or of another schema.
+            OSError: it cannot be read.
+        """
+        try:
+            content = json.loads(path.read_text())
+            schema = content.pop("schema")
+            if schema != SCHEMA:
+                raise ValueError(f"its schema is {schema}, this package reads {SCHEMA}")
+            content["key"] = RunKey(**content["key"])
+            content["episodes"] = tuple(Episode(**episode) for episode in content["episodes"])
+            result = cls(**content)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ResultError(f"{path} is not a result of a run: {type(error).__name__}: {error}") from error
+        if path.name != result.key.file_name:
+            raise ResultError(f"{path} holds the run of {result.key.file_name}")
+        return result
+
+
+def read_results(folder: Path) -> list[RunResult]:
+    """All results in a folder, sorted by task, method and seed.
+
+    Raises:
+        ResultError: a file is damaged, or there is none.
+    """
+    results = [RunResult.read(path) for path in folder.glob("*_seed*.json")]
+    if not results:
+        raise ResultError(f"{folder} holds no results of runs (files *_seed*.json)")
+    return sorted(results, key=lambda result: (result.key.task, result.key.method, result.key.seed))
