@@ -189,18 +189,26 @@ def test_a_dataset_of_episodes():
         learner.add_transitions(Episodes(data, []))
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning:minari.*")
 def test_a_minari_dataset(tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
+    from minari.data_collector import EpisodeBuffer
+
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    collector = minari.DataCollector(KnownPointMass(), record_infos=False)
-    collector.reset(seed=0)
-    for _ in range(LENGTH):
-        collector.step(np.array([0.5], dtype=np.float32))
-    dataset = collector.create_dataset("tests/point-mass-v0", algorithm_name="constant")
+    data = played(LENGTH)
+    episode = EpisodeBuffer(
+        id=0,
+        seed=0,
+        observations=np.concatenate([data["observation"], data["next_observation"][-1:]]),
+        actions=data["action"],
+        rewards=data["reward"],
+        terminations=np.zeros(LENGTH, dtype=bool),
+        truncations=np.arange(1, LENGTH + 1) == LENGTH,
+    )
+    minari.create_dataset_from_buffers("tests/point-mass-v0", [episode], env=KnownPointMass(), algorithm_name="random")
     learner = agent()
-    learner.add_transitions(dataset)
-    assert len(learner.store) == LENGTH
-    torch.testing.assert_close(learner.store.rewards, reward_fn(*learner.store.transitions()), rtol=1e-4, atol=1e-5)
+    learner.add_transitions(minari.load_dataset("tests/point-mass-v0"))
+    assert_stored(learner, data)
 
 
 @pytest.mark.parametrize(
