@@ -56,7 +56,7 @@ def is_one_line_error(result, *texts):
 
 def shown_defaults():
     """What the help of `dgpmpc train` shows for the options that can be left open."""
-    hints = typing.get_type_hints(cli.train, include_extras=True)
+    hints = typing.get_type_hints(cli.train.train, include_extras=True)
     return {name: hints[name].__metadata__[0].show_default for name in hints if hasattr(hints[name], "__metadata__")}
 
 
@@ -278,10 +278,10 @@ def test_options_show_the_agents_defaults_and_the_presets():
     options_of_the_agent = {name: shown for name, shown in shown_defaults().items() if name in arguments}
     assert len(options_of_the_agent) == 21
     del options_of_the_agent["seed"]  # the command line has a default of its own
-    assert inspect.signature(cli.train).parameters.keys() >= options_of_the_agent.keys()
+    assert inspect.signature(cli.train.train).parameters.keys() >= options_of_the_agent.keys()
     for name, shown in options_of_the_agent.items():
         default = arguments[name].default
-        assert inspect.signature(cli.train).parameters[name].default is None
+        assert inspect.signature(cli.train.train).parameters[name].default is None
         assert default is None or shown.split(",")[0] == str(default)
         presets = {preset[name] for preset in PAPER.values() if name in preset}
         assert ("ENV_ID" in shown) == bool(presets - {default}) or name == "num_elites"
