@@ -10,9 +10,9 @@ from typing import Annotated
 import typer
 
 import gym_dgpmpc  # noqa: F401  # registers the environments
-from gym_dgpmpc.cli import evaluate, train
+from gym_dgpmpc.cli import bench, evaluate, train
 
-COMMANDS = (train.train, evaluate.evaluate)
+COMMANDS = (train.train, evaluate.evaluate, bench.bench)
 """In the order in which `dgpmpc --help` shows them."""
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)

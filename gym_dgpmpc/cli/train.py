@@ -3,6 +3,7 @@
 import inspect
 import os
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -99,6 +100,8 @@ def train(
     num_samples: options.NumSamples = None,
     sample_spacing: options.SampleSpacing = None,
     resample_steps: options.Resample = None,
+    reward_fn: options.Reward = None,
+    terminated_fn: options.Termination = None,
 ) -> None:
     """Train an agent, and leave results, pictures and the agent itself in a folder.
 
@@ -125,6 +128,8 @@ def train(
         num_samples=num_samples,
         sample_spacing=sample_spacing,
         resample_steps=resample_steps,
+        reward_fn=reward_fn,
+        terminated_fn=terminated_fn,
         seed=seed,
     )
     with one_line_errors(ValueError, AssertionError, OSError):
@@ -167,6 +172,7 @@ def _set_up_run(
     checkpoint_every: int | None,
 ) -> "TrainingRun":
     """The run that the options describe, with what they leave open filled in."""
+    from gym_dgpmpc.agents import DGPMPCAgent
     from gym_dgpmpc.reporting.run import RunFolder, TrainingRun
 
     assert env.spec is not None
@@ -186,7 +192,7 @@ def _set_up_run(
         run = TrainingRun(
             folder,
             env,
-            arguments,
+            partial(DGPMPCAgent, **arguments),
             num_episodes=episodes,
             total_timesteps=timesteps,
             checkpoint_every=checkpoint_every,

@@ -1,6 +1,7 @@
 """A run keeps its results as they come, and goes on where its last finished episode ended."""
 
 import json
+from functools import partial
 
 import gymnasium
 import pytest
@@ -12,6 +13,7 @@ from gym_dgpmpc.reporting.run import RunFolder, RunFolderError, TrainingRun
 from tests.reporting.toy import EPISODE_STEPS, SMALLEST_AGENT
 
 HOLDERS = []
+make_agent = partial(DGPMPCAgent, **SMALLEST_AGENT, seed=0)
 SETTINGS = {"environment": "ToyPush-v0", "seed": 0}
 
 
@@ -22,7 +24,7 @@ def training_run(path, num_episodes=2, env_id="ToyPush-v0", **env_arguments):
     HOLDERS[:] = [folder]
     env = gymnasium.make(env_id, **env_arguments)
     steps = EPISODE_STEPS * (1 + num_episodes)
-    run = TrainingRun(folder, env, SMALLEST_AGENT | {"seed": 0}, num_episodes=num_episodes, total_timesteps=steps)
+    run = TrainingRun(folder, env, make_agent, num_episodes=num_episodes, total_timesteps=steps)
     folder.write_settings(episodes=num_episodes)
     return run
 
@@ -88,7 +90,7 @@ def test_a_run_that_was_killed_before_its_last_training_is_not_complete(tmp_path
         folder = RunFolder(tmp_path, SETTINGS)
         HOLDERS.append(folder)
         env = gymnasium.make("ToyPush-v0")
-        run = TrainingRun(folder, env, SMALLEST_AGENT | {"seed": 0}, num_episodes=None, total_timesteps=total_timesteps)
+        run = TrainingRun(folder, env, make_agent, num_episodes=None, total_timesteps=total_timesteps)
         folder.write_settings()
         return run
 
