@@ -72,10 +72,10 @@ def _on_this_machine(jobs: Sequence[Job], folders: Folders, num_processes: int) 
         try:
             with parallel_config(backend="loky", inner_max_num_threads=1):
                 pool = Parallel(processes, return_as="generator_unordered", batch_size=1, pre_dispatch=processes)
-                for index, outcome in pool(delayed(_numbered)(i, job, folders) for i, job in enumerate(batch)):
-                    left.remove(batch[index])
-                    losses = 0
-                    yield batch[index], outcome
+            for index, outcome in pool(delayed(_numbered)(i, job, folders) for i, job in enumerate(batch)):
+                left.remove(batch[index])
+                losses = 0
+                yield batch[index], outcome
         except TerminatedWorkerError as error:
             losses += 1
             if losses > LOSSES_TOGETHER + RETRIES:
@@ -117,7 +117,7 @@ def _connect_to_ray(address: str | None, num_processes: int) -> None:
 
     try:
         if address is not None or "RAY_ADDRESS" in os.environ:
-            ray.init(address, logging_level=logging.ERROR, log_to_driver=False)
+            ray.init(address)
             return
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster for one command tells nobody of itself
         ray.init(
@@ -166,3 +166,5 @@ def _on_dask(
                 again = submit(job)
                 pending[again] = job
                 completed.add(again)
+            except Exception as error:  # such as a module that the worker does not have
+                yield job, failed(error)

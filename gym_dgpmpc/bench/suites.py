@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from gym_dgpmpc.bench.jobs import Job
 from gym_dgpmpc.bench.methods import dgp_mpc
@@ -46,6 +46,7 @@ class Narrowed(NamedTuple):
     episodes: int | None = None
 
 
+@runtime_checkable
 class Suite(Protocol):
     """Jobs that belong together."""
 

@@ -16,14 +16,16 @@ class Task:
         episode_steps: after which an episode is truncated.
         env_id: what `gymnasium.make` makes it from; "" is the name up to the colon.
         presets_of: the environment whose entry in `agents.presets` holds for it; "" is the name up to the colon.
+        arguments: of the environment.
         for_planning: arguments of agents that plan with a model.
-        for_model_free: arguments of the environment that agents without a model learn in.
+        for_model_free: more arguments of the environment that agents without a model learn in.
     """
 
     name: str
     episode_steps: int
     env_id: str = ""
     presets_of: str = ""
+    arguments: Mapping[str, Any] = field(default_factory=dict)
     for_planning: Mapping[str, Any] = field(default_factory=dict)
     for_model_free: Mapping[str, Any] = field(default_factory=dict)
 
@@ -35,7 +37,7 @@ class Task:
     def make(self, *, model_free: bool = False) -> gymnasium.Env:
         """The environment, for an agent of one kind or the other."""
         env_id = self.env_id or self.name.partition(":")[0]
-        return gymnasium.make(env_id, **(self.for_model_free if model_free else {}))
+        return gymnasium.make(env_id, **self.arguments, **(self.for_model_free if model_free else {}))
 
 
 LEARNED_REWARD = {"reward_fn": "learned"}
