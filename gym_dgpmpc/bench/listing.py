@@ -47,6 +47,7 @@ def _line(job: Job, folders: Folders, pace: dict[tuple[str, str], float]) -> Lin
     try:
         if job.is_finished(folders.results):
             return Line(job, "finished", True, 0.0)
+        steps = job.steps_wanted(folders.results) if isinstance(job, Run) else 0
     except DGPMPCError as error:
         return Line(job, f"cannot be done: {error}", False, None)
     if not isinstance(job, Run):
@@ -56,7 +57,7 @@ def _line(job: Job, folders: Folders, pace: dict[tuple[str, str], float]) -> Lin
     seconds = pace.get((job.method, job.task.name))
     if seconds is None:
         return Line(job, state, False, None)
-    return Line(job, state, False, seconds * (job.max_steps - done * job.task.episode_steps))
+    return Line(job, state, False, seconds * (steps - done * job.task.episode_steps))
 
 
 def summary(lines: Sequence[Line]) -> str:

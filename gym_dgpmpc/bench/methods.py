@@ -159,6 +159,11 @@ def dgp_mpc(num_layers: int, kernel: str) -> str:
     return f"DGP-MPC L={num_layers} {kernel}"
 
 
+def random_steps(task: Task) -> int:
+    """Steps of random actions that planning agents start with on a task."""
+    return _planning(task).get("learning_starts") or task.episode_steps
+
+
 def _planning(task: Task) -> Mapping[str, Any]:
     """The paper's settings on its tasks, this package's own on Gymnasium's, else none."""
     stock: Mapping[str, Mapping[str, Any]] = getattr(presets, "STOCK", {})
@@ -171,8 +176,8 @@ def _planning_alone(task: Task) -> Mapping[str, Any]:
 
 
 def _off_policy(task: Task) -> Mapping[str, Any]:
-    """Random actions for one episode, as every planning agent starts."""
-    return {"learning_starts": task.episode_steps}
+    """On the paper's tasks random actions for one episode, as every planning agent starts there."""
+    return {"learning_starts": task.episode_steps} if task.preset in presets.PAPER else {}
 
 
 def _on_policy(task: Task) -> Mapping[str, Any]:

@@ -18,7 +18,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from gym_dgpmpc.bench.jobs import Folders
-from gym_dgpmpc.bench.methods import METHODS, ModelFreeMethod, PlanningMethod, Settings
+from gym_dgpmpc.bench.methods import METHODS, ModelFreeMethod, PlanningMethod, Settings, random_steps
 from gym_dgpmpc.bench.results import Actions, Episode, RunKey, RunResult
 from gym_dgpmpc.bench.tasks import Task
 from gym_dgpmpc.errors import DGPMPCError, RunInUseError
@@ -43,7 +43,9 @@ class Run:
         task: the task.
         seed: decides everything random.
         episodes: to be played after the random ones.
-        times: of methods without a model, as many times the steps that those episodes and a random one have.
+        times: of methods without a model, as many times the steps that a planning agent has in so many episodes.
+        steps_of: of methods without a model, the planning method whose own run on this task with this seed tells these
+            steps, once it is there; until then its episodes count as if none ended early.
         asked: settings in place of the method's own.
         command: that makes this run.
     """
@@ -53,6 +55,7 @@ class Run:
     seed: int
     episodes: int
     times: int = 1
+    steps_of: str | None = None
     asked: Mapping[str, Any] = field(default_factory=dict)
     command: str = "Run(...).perform(...)"
 
@@ -80,9 +83,18 @@ class Run:
     def max_steps(self) -> int:
         """Environment steps after which the run ends, however many episodes they were."""
         if METHODS[self.method].is_model_free:
-            return self.times * (1 + self.episodes) * self.task.episode_steps
-        random_steps = self.settings.get("learning_starts") or self.task.episode_steps
-        return random_steps + self.episodes * self.task.episode_steps
+            return self.times * (random_steps(self.task) + self.episodes * self.task.episode_steps)
+        at_random = self.settings.get("learning_starts") or self.task.episode_steps
+        return at_random + self.episodes * self.task.episode_steps
+
+    def steps_wanted(self, results: Path) -> int:
+        """The same, or what the run of ``steps_of`` in the folder leaves of it."""
+        if self.steps_of is None:
+            return self.max_steps
+        path = results / RunKey(self.steps_of, self.task.name, self.seed).file_name
+        if not path.exists():
+            return self.max_steps
+        return min(self.max_steps, self.times * RunResult.read(path).episodes[-1].total_steps)
 
     def is_finished(self, results: Path) -> bool:
         """Whether the folder holds this run, of as many episodes or steps or more.
@@ -109,7 +121,8 @@ class Run:
         if len(result.counted) >= self.episodes and not METHODS[self.method].is_model_free:
             return True
         last = result.episodes[-1].total_steps if result.episodes else 0
-        return last > self.max_steps - self.task.episode_steps  # an episode that was cut off at the end is not told of
+        # An episode that was cut off at the end is not told of.
+        return last > self.steps_wanted(results) - self.task.episode_steps
 
     def episodes_so_far(self, work: Path) -> int:
         """Episodes of an unfinished run that it will not have to play again."""
@@ -129,7 +142,7 @@ class Run:
         if isinstance(method, PlanningMethod):
             result = self._plan(method, folders)
         else:
-            result = self._learn_without_model(method)
+            result = self._learn_without_model(method, self.steps_wanted(folders.results))
         result.write(folders.results)
         returns = [episode.episode_return for episode in result.counted]
         minutes = sum(episode.seconds for episode in result.episodes) / 60
@@ -169,14 +182,14 @@ class Run:
             **{name: facts[name] for name in ("started", "revision", "versions", "machine")},
         )
 
-    def _learn_without_model(self, method: ModelFreeMethod) -> RunResult:
+    def _learn_without_model(self, method: ModelFreeMethod, num_steps: int) -> RunResult:
         settings, started = self.settings, datetime.now(timezone.utc)
         with closing(EpisodeRecorder(self.task.make(model_free=True))) as env:
             model = method.make(env, settings, self.seed)
             watch = _Stopwatch()
             setattr(model.policy, method.acts_by, watch.around(getattr(model.policy, method.acts_by)))
             episodes = _EpisodeList(env, settings.get("learning_starts", 0))
-            model.learn(self.max_steps, callback=episodes)
+            model.learn(num_steps, callback=episodes)
         return RunResult(
             key=self.key,
             episodes=tuple(episodes.found),

@@ -20,11 +20,11 @@ PAPER_SEEDS = tuple(range(10))
 
 BASELINES = ("PETS TS1", "PETS TSinf", "GP-MM", "GP-DS", "SAC", "TD3", "PPO")
 STOCK_TASKS = {
-    "Pendulum-v1": 10,
-    "Pendulum-v1:learned reward": 10,
+    "Pendulum-v1": 6,
+    "Pendulum-v1:learned reward": 6,
     "InvertedPendulum-v5": 5,
     "InvertedDoublePendulum-v5": 10,
-    "Reacher-v5": 15,
+    "Reacher-v5": 10,
     "Swimmer-v5": 10,
     "FetchReachDense-v4": 10,
 }
@@ -69,7 +69,8 @@ class Cell(NamedTuple):
     task: str
     episodes: int
     times: int = 1
-    """See `Run`."""
+    steps_of: str | None = None
+    """These two: see `Run`."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,7 @@ class RunSuite:
             seed,
             cell.episodes if episodes is None else episodes,
             cell.times,
+            cell.steps_of,
             command=shlex.join(["dgpmpc", "bench", self.name, *options]),
         )
 
@@ -133,9 +135,14 @@ def _paper(methods: Iterable[str]) -> tuple[Cell, ...]:
 
 
 def _stock() -> tuple[Cell, ...]:
-    planned = [Cell(dgp_mpc(2, "matern32"), task, episodes) for task, episodes in STOCK_TASKS.items()]
+    method = dgp_mpc(2, "matern32")
+    planned = [Cell(method, task, episodes) for task, episodes in STOCK_TASKS.items()]
     # SAC knows no reward function, so to it a task with a learned one is the task itself.
-    model_free = [Cell("SAC", task, count, STOCK_TIMES) for task, count in STOCK_TASKS.items() if ":" not in task]
+    model_free = [
+        Cell("SAC", task, episodes, STOCK_TIMES, steps_of=method)
+        for task, episodes in STOCK_TASKS.items()
+        if ":" not in task
+    ]
     return (*planned, *model_free)
 
 

@@ -120,6 +120,19 @@ def test_without_a_model_the_steps_count(folders):
     assert replace(run, times=2).max_steps == 2 * 2 * EPISODE_STEPS
 
 
+def test_the_steps_of_another_run_count_once_it_is_there(folders):
+    """Ten times the steps of a run whose episodes ended early are ten times fewer."""
+    planned = tiny(DGP, toy(terminate_at=4), episodes=1)
+    run = tiny("PPO", episodes=1, times=3, steps_of=DGP)
+    assert run.steps_wanted(folders.results) == run.max_steps == 3 * 2 * EPISODE_STEPS
+    planned.perform(folders)
+    assert run.steps_wanted(folders.results) == 3 * 2 * 4
+    assert not run.is_finished(folders.results)
+    run.perform(folders)
+    assert RunResult.read(folders.results / run.file_name).episodes[-1].total_steps == 3 * 2 * 4
+    assert run.is_finished(folders.results)
+
+
 def test_short_episodes_are_counted(folders):
     run = tiny("TD3", toy(terminate_at=5), episodes=1, asked={"learning_starts": 7})
     run.perform(folders)

@@ -108,6 +108,7 @@ def test_the_other_suites():
     assert set(planned) == {*model_free, "Pendulum-v1:learned reward"}
     assert planned["Pendulum-v1:learned reward"].settings["reward_fn"] == "learned"
     assert all(run.max_steps == 10 * planned[name].max_steps for name, run in model_free.items())
+    assert {run.steps_of for run in model_free.values()} == {run.method for run in planned.values()}
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))

@@ -12,7 +12,7 @@ from tests.reporting.toy import EPISODE_STEPS, SMALLEST_AGENT, ToyPush
 
 NETWORKS = {"num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4), "num_particles": 5}
 PLANNING = {"horizon": 3, "num_candidates": 6, "num_elites": 2, "num_iterations": 1}
-OFF_POLICY = {"batch_size": 4, "buffer_size": 100}
+OFF_POLICY = {"batch_size": 4, "buffer_size": 100, "learning_starts": EPISODE_STEPS}
 TINY = {
     "DGP-MPC L=1 matern32": {name: value for name, value in SMALLEST_AGENT.items() if name != "num_layers"},
     "PETS TS1": NETWORKS | PLANNING,
