@@ -266,7 +266,7 @@ def test_version_and_help(run):
     version = run("--version")
     assert version.exit_code == 0
     assert version.stdout == f"dgpmpc {importlib.metadata.version('gym-dgpmpc')}\n"
-    for command in ([], ["train"], ["evaluate"]):
+    for command in ([], ["train"], ["evaluate"], ["bench"]):
         shown = run(*command, "--help")
         assert shown.exit_code == 0
         assert "Usage" in shown.stdout

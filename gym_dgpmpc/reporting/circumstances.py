@@ -9,8 +9,6 @@ from typing import Any
 
 import torch
 
-import gym_dgpmpc
-
 PACKAGES = ("gym-dgpmpc", "gymnasium", "mujoco", "numpy", "stable-baselines3", "torch")
 UNKNOWN = "unknown"
 
@@ -30,7 +28,7 @@ def machine() -> dict[str, Any]:
     }
 
 
-def revision(package: Path = Path(gym_dgpmpc.__file__).parent) -> str:
+def revision(package: Path = Path(__file__).parents[1]) -> str:
     """The commit of a package's source, marked "-dirty" if the package differs from it; "unknown" without one.
 
     Other files of the repository do not count, and neither does a repository that the package only happens to be
