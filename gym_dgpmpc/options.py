@@ -28,6 +28,10 @@ class RefreshName(str, Enum):
     plan = "plan"
 
 
+class SourceName(str, Enum):
+    learned = "learned"
+
+
 def _option(name: str, text: str, default: str, panel: str, minimum: int | None = None) -> Any:
     return typer.Option(name, help=text, show_default=default, rich_help_panel=panel, min=minimum)
 
@@ -102,4 +106,12 @@ NumSamples = Annotated[
 SampleSpacing = Annotated[int | None, _training("--spacing", "Sampler steps between two kept samples.", "10")]
 Resample = Annotated[
     int | None, _training("--resample", "Sampler steps on the grown data after each control step.", "10", 0)
+]
+
+_REWARD = "Whether the model learns to predict the reward, even where it is known."
+_TERMINATION = "Whether the model learns to predict an episode's end, even where it is known."
+
+Reward = Annotated[SourceName | None, _option("--reward", _REWARD, "what is known; else learned", "Task")]
+Termination = Annotated[
+    SourceName | None, _option("--termination", _TERMINATION, "what is known; else learned", "Task")
 ]

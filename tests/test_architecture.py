@@ -58,6 +58,15 @@ NEWER_THAN_PYTHON_3_10 = {
 
 RUNS_CODE_FROM_FILES = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
 RUNS_CODE_FROM_FILES |= {"stable_baselines3.common.save_util", "torch.load", "torch.save"}
+ALLOWED_ALL_THE_SAME = {
+    # joblib's processes exchange pickles through pipes, with processes that this one has started; what loads and keeps
+    # files (`joblib.load`, `joblib.dump`, `joblib.Memory`) stays forbidden there too.
+    "gym_dgpmpc.bench.executors": {
+        "joblib", "joblib.Parallel", "joblib.delayed", "joblib.parallel_config",
+        "joblib.externals.loky.process_executor", "joblib.externals.loky.process_executor.TerminatedWorkerError",
+    },
+}  # fmt: skip
+"""By module, with the reason."""
 
 GLOBAL_RANDOMNESS = {"random", "torch.distributions", "torch.manual_seed", "torch.seed", "torch.random"}
 TORCH_RANDOM = {
@@ -100,7 +109,8 @@ def upward_imports(module: str, tree: ast.AST) -> list[str]:
     """Imports from a layer below the module's own."""
     names = {name for name in imports(tree) if name.split(".")[0] == "gym_dgpmpc"}
     # `from gym_dgpmpc import types` names the package itself too, but takes only the module from it.
-    names -= {"gym_dgpmpc"} if any(name.count(".") == 1 and name in MODULES for name in names) else set()
+    modules = {name.removesuffix(".__init__") for name in MODULES}
+    names -= {"gym_dgpmpc"} if any(name.count(".") == 1 and name in modules for name in names) else set()
     return sorted(name for name in names if layer_of(name) > layer_of(module))
 
 
@@ -174,8 +184,14 @@ def test_can_be_read_at_once(source):
     assert len(source.splitlines()) <= MAX_LINES
 
 
-def test_runs_no_code_from_files(tree):
-    assert forbidden(tree, RUNS_CODE_FROM_FILES) == []
+def test_runs_no_code_from_files(module, tree):
+    assert set(forbidden(tree, RUNS_CODE_FROM_FILES)) <= ALLOWED_ALL_THE_SAME.get(module, set())
+
+
+def test_exceptions_are_of_modules_that_need_them():
+    for module, allowed in ALLOWED_ALL_THE_SAME.items():
+        tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
+        assert set(forbidden(tree, RUNS_CODE_FROM_FILES)) == allowed
 
 
 def test_randomness_is_an_argument(tree):

@@ -56,7 +56,7 @@ def is_one_line_error(result, *texts):
 
 def shown_defaults():
     """What the help of `dgpmpc train` shows for the options that can be left open."""
-    hints = typing.get_type_hints(cli.train, include_extras=True)
+    hints = typing.get_type_hints(cli.train.train, include_extras=True)
     return {name: hints[name].__metadata__[0].show_default for name in hints if hasattr(hints[name], "__metadata__")}
 
 
@@ -208,6 +208,15 @@ def test_a_reward_that_nobody_knows_is_learned(run, drawable):
     assert evaluated.exit_code == 0, evaluated.output
 
 
+def test_what_is_known_is_learned_when_asked(run):
+    command = ("train", ENV_ID, *SMALLEST, "--episodes", 1, "--no-video", "--out", "a")
+    result = run(*command, "--reward", "learned", "--termination", "learned")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith("reward: learned | termination: learned, once an episode has terminated\n")
+    assert read_checkpoint("a/agent.zip").config["modelled"]["reward"]
+    assert is_one_line_error(run(*command), "reward_fn was learned, now None")
+
+
 def test_a_task_with_a_goal(run):
     """Its observations are dicts; its forecasts, figures and rows are those of vectors."""
     gymnasium.register("GoalOfTheTests-v0", Goal, max_episode_steps=LENGTH)
@@ -257,7 +266,7 @@ def test_version_and_help(run):
     version = run("--version")
     assert version.exit_code == 0
     assert version.stdout == f"dgpmpc {importlib.metadata.version('gym-dgpmpc')}\n"
-    for command in ([], ["train"], ["evaluate"]):
+    for command in ([], ["train"], ["evaluate"], ["bench"]):
         shown = run(*command, "--help")
         assert shown.exit_code == 0
         assert "Usage" in shown.stdout
@@ -276,12 +285,12 @@ def test_runs_as_a_module():
 def test_options_show_the_agents_defaults_and_the_presets():
     arguments = inspect.signature(DGPMPCAgent).parameters
     options_of_the_agent = {name: shown for name, shown in shown_defaults().items() if name in arguments}
-    assert len(options_of_the_agent) == 21
+    assert len(options_of_the_agent) == 23
     del options_of_the_agent["seed"]  # the command line has a default of its own
-    assert inspect.signature(cli.train).parameters.keys() >= options_of_the_agent.keys()
+    assert inspect.signature(cli.train.train).parameters.keys() >= options_of_the_agent.keys()
     for name, shown in options_of_the_agent.items():
         default = arguments[name].default
-        assert inspect.signature(cli.train).parameters[name].default is None
+        assert inspect.signature(cli.train.train).parameters[name].default is None
         assert default is None or shown.split(",")[0] == str(default)
         presets = {preset[name] for preset in PAPER.values() if name in preset}
         assert ("ENV_ID" in shown) == bool(presets - {default}) or name == "num_elites"

@@ -33,6 +33,11 @@ class ActingAgent(PlanningAgent):
         return [RunningEpisode(cold, EpisodeRecord(1, horizon), -1, has_explored) for _ in range(self.n_envs)]
 
     @property
+    def episode_records(self) -> list[EpisodeRecord]:
+        """Of each environment, what happened so far in its running episode, or in the one that has just ended."""
+        return [running.record for running in self._running]
+
+    @property
     def is_exploring(self) -> bool:
         """Whether the next actions are random because there are too few transitions to learn from."""
         if self.is_fitted:

@@ -226,7 +226,10 @@ def _restore_running(agent: Any, checkpoint: Checkpoint, own: dict[str, Any]) ->
 
 
 def encode(value: Any) -> Any:
-    return {"observation_spec": asdict(value)} if isinstance(value, ObservationSpec) else value
+    """An argument as JSON has it, where a tuple is a list."""
+    if isinstance(value, ObservationSpec):
+        return {"observation_spec": asdict(value)}
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _only_tensors(state: StateDict) -> dict[str, Tensor]:

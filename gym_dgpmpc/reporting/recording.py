@@ -17,6 +17,7 @@ from gym_dgpmpc.planning.rollout import rollout
 from gym_dgpmpc.reporting.figures import Forecast
 from gym_dgpmpc.reporting.rendering import shrink
 from gym_dgpmpc.types import TransitionSampler
+from gym_dgpmpc.wrappers.risk_sensitive import ORIGINAL_REWARD
 
 NUM_FORECAST_PARTICLES = 100
 MAX_FRAMES, MAX_FRAMES_PER_SECOND = 400, 25
@@ -34,6 +35,8 @@ class Episode(NamedTuple):
 
 class EpisodeRecorder(gymnasium.Wrapper):
     """Keeps the last episode that ended, its pictures too if the environment renders `rgb_array`.
+
+    Of a task whose `step` was made to return another reward (`RiskSensitiveReward`) it keeps the task's own.
 
     A long episode's pictures are thinned out, evenly, so that its GIF keeps the true speed at a readable size.
 
@@ -70,10 +73,10 @@ class EpisodeRecorder(gymnasium.Wrapper):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        result = observation, reward, terminated, truncated, _ = self.env.step(action)
+        result = observation, reward, terminated, truncated, info = self.env.step(action)
         self._observations.append(np.array(flatten(observation)))
         self._actions.append(np.array(action))
-        self._rewards.append(float(reward))
+        self._rewards.append(float(info.get(ORIGINAL_REWARD, reward)))
         if self.num_steps % self._steps_per_frame == 0:
             self._add_frame()
         if terminated or truncated:

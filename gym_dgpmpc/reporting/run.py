@@ -6,31 +6,28 @@ and `last_episode.gif`. A run that was killed goes on to the same files; only wh
 """
 
 import csv
-import importlib.metadata
 import io
 import json
-import os
-import platform
 import shutil
 import time
+from collections.abc import Callable
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
-import torch
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
-from gym_dgpmpc.agents import DGPMPCAgent
+from gym_dgpmpc.agents import MPCAgent
 from gym_dgpmpc.agents.files import replace_text
 from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
 from gym_dgpmpc.agents.safeguard import resume_from
 from gym_dgpmpc.errors import DGPMPCError
+from gym_dgpmpc.reporting.circumstances import machine, revision, versions
 from gym_dgpmpc.reporting.figures import observation_labels, plot_learning_curve, plot_prediction_fan
 from gym_dgpmpc.reporting.recording import EpisodeRecorder, ForecastCallback
 from gym_dgpmpc.reporting.rendering import write_gif
 
-PACKAGES = ("gym-dgpmpc", "gymnasium", "mujoco", "numpy", "stable-baselines3", "torch")
 SETTINGS_FILE, EPISODES_FILE, LOGS, LOG_NAME = "settings.json", "episodes.csv", "tensorboard", "DGPMPC"
 FIGURES = LEARNING_CURVE, PREDICTION_FAN, LAST_EPISODE = "learning_curve.png", "prediction_fan.png", "last_episode.gif"
 
@@ -52,9 +49,15 @@ class EpisodeRow(NamedTuple):
     """Environment steps of the run up to the episode's end."""
     seconds: float
     """Wall-clock time since the last episode's end, training included."""
+    planning_seconds: float = 0.0
+    """The part of it in which plans were made."""
+    success: bool | None = None
+    """Whether the goal was reached in the last step, of tasks that say so in ``info["is_success"]``."""
 
     @classmethod
     def from_text(cls, row: dict[str, str]) -> "EpisodeRow":
+        """A row as `csv.DictReader` reads it; one of an older version lacks the last columns."""
+        success = row.get("success") or None
         return cls(
             int(row["episode"]),
             row["actions"],
@@ -62,7 +65,17 @@ class EpisodeRow(NamedTuple):
             int(row["steps"]),
             int(row["total_steps"]),
             float(row["seconds"]),
+            float(row.get("planning_seconds", 0.0)),
+            None if success is None else success == str(True),
         )
+
+
+def read_rows(path: Path) -> list[EpisodeRow]:
+    """All episodes in an `episodes.csv`; none if there is no such file."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [EpisodeRow.from_text(row) for row in csv.DictReader(file)]
 
 
 class RunFolder:
@@ -72,6 +85,7 @@ class RunFolder:
         path: the folder; made if there is none.
         settings: what identifies the run: going on with another run's folder is refused.
         overwrite: begin anew even if the folder holds a run.
+        otherwise: what the error over another run's folder advises.
 
     Raises:
         RunFolderError: the folder holds a run with other settings.
@@ -79,8 +93,16 @@ class RunFolder:
         CheckpointWriteError: it cannot be written to. It is an OSError too.
     """
 
-    def __init__(self, path: Path, settings: dict[str, Any], *, overwrite: bool = False):
+    def __init__(
+        self,
+        path: Path,
+        settings: dict[str, Any],
+        *,
+        overwrite: bool = False,
+        otherwise: str = "choose another folder with --out, or --overwrite to begin anew",
+    ):
         self.path, self.settings = path, json.loads(json.dumps(settings))
+        self._otherwise = otherwise
         self.checkpoints = RunCheckpoints(path)
         self.agent_file, self.episodes_file = self.checkpoints.newest, path / EPISODES_FILE
         try:
@@ -109,24 +131,20 @@ class RunFolder:
         content = {
             "settings": self.settings,
             **facts,
-            "started": self._settings_before().get("started", now) if self.goes_on else now,
-            "versions": {"python": platform.python_version()}
-            | {name: importlib.metadata.version(name) for name in PACKAGES},
-            "machine": {
-                "system": platform.system(),
-                "processor": platform.machine(),
-                "cores": os.cpu_count(),
-                "threads": torch.get_num_threads(),
-            },
+            "started": self.read_settings().get("started", now) if self.goes_on else now,
+            "revision": revision(),
+            "versions": versions(),
+            "machine": machine(),
         }
         replace_text(self.path / SETTINGS_FILE, json.dumps(content, indent=2) + "\n")
 
+    def read_settings(self) -> dict[str, Any]:
+        """What `write_settings` wrote the last time."""
+        return json.loads((self.path / SETTINGS_FILE).read_text())
+
     def rows(self) -> list[EpisodeRow]:
         """All episodes so far."""
-        if not self.episodes_file.exists():
-            return []
-        with self.episodes_file.open(newline="") as file:
-            return [EpisodeRow.from_text(row) for row in csv.DictReader(file)]
+        return read_rows(self.episodes_file)
 
     def write_rows(self, rows: list[EpisodeRow]) -> None:
         """Replace all rows, the column names included; a kill leaves the old rows or the new ones."""
@@ -134,12 +152,9 @@ class RunFolder:
         csv.writer(text).writerows([EpisodeRow._fields, *rows])
         replace_text(self.episodes_file, text.getvalue())
 
-    def _settings_before(self) -> dict[str, Any]:
-        return json.loads((self.path / SETTINGS_FILE).read_text())
-
     def _refuse_other_settings(self) -> None:
         try:
-            before = self._settings_before()["settings"]
+            before = self.read_settings()["settings"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise RunFolderError(f"{self.path} holds an agent without readable {SETTINGS_FILE}: {error}") from error
         differing = [
@@ -149,8 +164,7 @@ class RunFolder:
         ]
         if differing:
             raise RunFolderError(
-                f"{self.path} holds a run with other settings ({'; '.join(differing)}): "
-                "choose another folder with --out, or --overwrite to begin anew"
+                f"{self.path} holds a run with other settings ({'; '.join(differing)}): {self._otherwise}"
             )
 
 
@@ -160,11 +174,13 @@ class TrainingRun:
     Args:
         folder: where to record.
         env: the environment; if it renders `rgb_array` the last episode becomes a GIF.
-        agent_arguments: of `DGPMPCAgent`.
+        make_agent: makes the agent: (environment, verbose=..., tensorboard_log=...) -> `MPCAgent`.
         num_episodes: planned episodes after which to stop, or None.
         total_timesteps: environment steps after which to stop, the random ones included.
         checkpoint_every: see `MPCAgent.learn`.
         title: of the figures.
+        results_only: print nothing, draw nothing, and leave out what the agent would learn from the last episode,
+            which it does first of all if the run goes on to more episodes.
 
     Raises:
         CheckpointError: the folder's checkpoints are damaged, or of another agent.
@@ -174,17 +190,19 @@ class TrainingRun:
         self,
         folder: RunFolder,
         env: gymnasium.Env,
-        agent_arguments: dict[str, Any],
+        make_agent: Callable[..., MPCAgent],
         *,
         num_episodes: int | None,
         total_timesteps: int,
         checkpoint_every: int | None = None,
         title: str = "",
+        results_only: bool = False,
     ):
         self.folder, self.num_episodes, self.total_timesteps = folder, num_episodes, total_timesteps
-        self.checkpoint_every, self.title = checkpoint_every, title
+        self.checkpoint_every, self.title, self.results_only = checkpoint_every, title, results_only
         self.recorder = EpisodeRecorder(env)
-        self.agent = DGPMPCAgent(self.recorder, **agent_arguments, verbose=1, tensorboard_log=str(folder.path / LOGS))
+        logs = str(folder.path / LOGS)
+        self.agent = make_agent(self.recorder, verbose=0 if results_only else 1, tensorboard_log=logs)
         rows = []
         if resume_from(self.agent, folder.checkpoints):
             # An episode whose row was written but whose agent was not saved will be played again.
@@ -192,12 +210,12 @@ class TrainingRun:
         folder.write_rows(rows)
         self.figures: list[Path] = []
         """The figures that were drawn, once the last episode has ended."""
-        self.forecasts = ForecastCallback(self.agent, self.recorder)
+        self.forecasts = None if results_only else ForecastCallback(self.agent, self.recorder)
 
     @property
     def is_complete(self) -> bool:
         """Whether everything that was asked for has been done before."""
-        return self._has_enough and not self.agent.is_training_due
+        return self._has_enough and (self.results_only or not self.agent.is_training_due)
 
     @property
     def _has_enough(self) -> bool:
@@ -207,16 +225,16 @@ class TrainingRun:
         return enough or self.agent.num_timesteps >= self.total_timesteps
 
     def train(self, *, progress_bar: bool) -> None:
-        """Learn until the end, and leave a model in the agent that has seen every finished episode.
+        """Learn until the end, and (unless `results_only`) leave a model that has seen every finished episode.
 
         Raises:
             DGPMPCError: planning or the environment failed; everything that was observed is saved.
             KeyboardInterrupt, SystemExit: Ctrl-C or SIGTERM; see `MPCAgent.learn`.
         """
-        callback = CallbackList([self.forecasts, _KeepEpisodes(self)])
+        callback = CallbackList([*([] if self.forecasts is None else [self.forecasts]), _KeepEpisodes(self)])
         # A run that the callback stops ends before its last episode is learned from; without steps `learn` only trains.
         steps = 0 if self._has_enough else self.total_timesteps - self.agent.num_timesteps
-        for steps_of_call in (steps, 0):
+        for steps_of_call in (steps,) if self.results_only else (steps, 0):
             self.agent.learn(
                 steps_of_call,
                 callback,
@@ -226,7 +244,7 @@ class TrainingRun:
                 run_folder=self.folder.checkpoints,
                 checkpoint_every=self.checkpoint_every,
             )
-        if not self.figures:
+        if not self.figures and not self.results_only:
             self.figures = self.write_figures(self.title)
 
     def write_figures(self, title: str) -> list[Path]:
@@ -241,7 +259,7 @@ class TrainingRun:
                 num_random=sum(row.actions == "random" for row in rows),
                 episode_steps=[row.steps for row in rows],
             )
-        if self.forecasts.forecasts:
+        if self.forecasts is not None and self.forecasts.forecasts:
             env = self.recorder.unwrapped
             written.append(self.folder.path / PREDICTION_FAN)
             plot_prediction_fan(
@@ -275,6 +293,7 @@ class _KeepEpisodes(BaseCallback):
         folder, agent, episode = self.run.folder, self.run.agent, self.run.recorder.last
         assert episode is not None
         rows = folder.rows()
+        success = self.locals["infos"][0].get("is_success")
         row = EpisodeRow(
             episode=len(rows) + 1,
             actions="planned" if agent.is_fitted else "random",
@@ -282,10 +301,12 @@ class _KeepEpisodes(BaseCallback):
             steps=len(episode.rewards),
             total_steps=agent.num_timesteps,
             seconds=round(time.perf_counter() - self._since, 3),
+            planning_seconds=round(sum(agent.episode_records[0].plan_seconds), 3),
+            success=None if success is None else bool(success),
         )
         folder.write_rows([*rows, row])
         self._since = time.perf_counter()
         is_last = sum(row.actions == "planned" for row in [*rows, row]) == self.run.num_episodes
-        if is_last or agent.num_timesteps >= self.run.total_timesteps:
+        if (is_last or agent.num_timesteps >= self.run.total_timesteps) and not self.run.results_only:
             self.run.figures = self.run.write_figures(self.run.title)
         return not is_last

@@ -16,6 +16,9 @@ from torch import Tensor
 from gym_dgpmpc.envs import known
 from gym_dgpmpc.types import RewardFn
 
+ORIGINAL_REWARD = "reward_original"
+"""Where ``info`` holds the reward that agents are compared by, if `step` may return another one."""
+
 
 @dataclass(frozen=True)
 class AnglePenalty:
@@ -100,7 +103,7 @@ class RiskSensitiveReward(gym.Wrapper, RecordConstructorArgs):
         observation, reward, terminated, truncated, info = self.env.step(action)
         original = float(reward)
         penalised = original - float(self._penalty(torch.from_numpy(np.asarray(observation))))
-        info = {**info, "reward_original": original, "reward_risk_sensitive": penalised}
+        info = {**info, ORIGINAL_REWARD: original, "reward_risk_sensitive": penalised}
         return observation, penalised if self._penalise_step else original, terminated, truncated, info
 
 

@@ -1,6 +1,7 @@
 """A run keeps its results as they come, and goes on where its last finished episode ended."""
 
 import json
+from functools import partial
 
 import gymnasium
 import pytest
@@ -8,10 +9,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from gym_dgpmpc.agents import DGPMPCAgent
 from gym_dgpmpc.errors import PlanningError
-from gym_dgpmpc.reporting.run import RunFolder, RunFolderError, TrainingRun
+from gym_dgpmpc.reporting.run import EpisodeRow, RunFolder, RunFolderError, TrainingRun, read_rows
 from tests.reporting.toy import EPISODE_STEPS, SMALLEST_AGENT
 
 HOLDERS = []
+make_agent = partial(DGPMPCAgent, **SMALLEST_AGENT, seed=0)
 SETTINGS = {"environment": "ToyPush-v0", "seed": 0}
 
 
@@ -22,7 +24,7 @@ def training_run(path, num_episodes=2, env_id="ToyPush-v0", **env_arguments):
     HOLDERS[:] = [folder]
     env = gymnasium.make(env_id, **env_arguments)
     steps = EPISODE_STEPS * (1 + num_episodes)
-    run = TrainingRun(folder, env, SMALLEST_AGENT | {"seed": 0}, num_episodes=num_episodes, total_timesteps=steps)
+    run = TrainingRun(folder, env, make_agent, num_episodes=num_episodes, total_timesteps=steps)
     folder.write_settings(episodes=num_episodes)
     return run
 
@@ -39,6 +41,9 @@ def test_results(tmp_path, capsys):
     ]
     assert rows[-1].episode_return == run.recorder.last.rewards.sum()
     assert all(row.seconds > 0 for row in rows)
+    assert [row.planning_seconds > 0 for row in rows] == [False, True, True]
+    assert all(row.planning_seconds < row.seconds for row in rows)
+    assert {row.success for row in rows} == {None}
     assert capsys.readouterr().out.count("\nepisode ") == 3
     written = run.write_figures("a title")
     assert [path.name for path in written] == ["learning_curve.png", "prediction_fan.png", "last_episode.gif"]
@@ -48,6 +53,7 @@ def test_results(tmp_path, capsys):
     assert settings["settings"] == SETTINGS
     assert settings["episodes"] == 2
     assert "torch" in settings["versions"]
+    assert settings["revision"]
 
 
 def test_the_saved_agent_has_learned_from_every_episode(tmp_path):
@@ -88,7 +94,7 @@ def test_a_run_that_was_killed_before_its_last_training_is_not_complete(tmp_path
         folder = RunFolder(tmp_path, SETTINGS)
         HOLDERS.append(folder)
         env = gymnasium.make("ToyPush-v0")
-        run = TrainingRun(folder, env, SMALLEST_AGENT | {"seed": 0}, num_episodes=None, total_timesteps=total_timesteps)
+        run = TrainingRun(folder, env, make_agent, num_episodes=None, total_timesteps=total_timesteps)
         folder.write_settings()
         return run
 
@@ -175,3 +181,32 @@ def test_overwrites_only_when_asked(tmp_path):
     folder = RunFolder(tmp_path, {"seed": 1}, overwrite=True)
     assert not folder.goes_on
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", ".lock-holder.json", "notes.txt"]
+
+
+@pytest.mark.parametrize("success", [True, False, None])
+def test_what_is_written_of_an_episode_is_read_again(tmp_path, success):
+    rows = [EpisodeRow(1, "planned", -0.125, 12, 12, 2.5, 1.25, success)]
+    folder = RunFolder(tmp_path, SETTINGS)
+    folder.write_rows(rows)
+    folder.close()
+    assert read_rows(tmp_path / "episodes.csv") == rows
+
+
+def test_episodes_of_an_older_version_are_read(tmp_path):
+    path = tmp_path / "episodes.csv"
+    assert read_rows(path) == []
+    path.write_text("episode,actions,episode_return,steps,total_steps,seconds\n1,random,-0.5,12,12,0.25\n")
+    assert read_rows(path) == [EpisodeRow(1, "random", -0.5, 12, 12, 0.25, 0.0, None)]
+
+
+def test_for_results_only_nothing_is_drawn_or_said(tmp_path, capsys):
+    folder = RunFolder(tmp_path, SETTINGS)
+    env = gymnasium.make("ToyPush-v0", render_mode="rgb_array")
+    run = TrainingRun(folder, env, make_agent, num_episodes=1, total_timesteps=24, results_only=True)
+    run.train(progress_bar=False)
+    assert run.is_complete
+    assert capsys.readouterr().out == ""
+    assert not list(tmp_path.glob("*.png"))
+    assert not list(tmp_path.glob("*.gif"))
+    assert run.agent.num_fitted == 12  # of the last episode it learns when there is another one
+    folder.close()

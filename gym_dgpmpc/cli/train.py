@@ -1,54 +1,33 @@
-"""The command line: `dgpmpc train ENV_ID` and `dgpmpc evaluate PATH`.
+"""`dgpmpc train ENV_ID`."""
 
-Says what is wrong in one line, with exit code 2; stops with 130 after Ctrl-C and with 143 after SIGTERM. What is slow
-to import is imported when a command runs, so that `--help` answers at once.
-"""
-
-import importlib.metadata
 import inspect
 import os
 import time
-import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager
-from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import gymnasium
 import typer
 
-import gym_dgpmpc  # noqa: F401  # registers the environments
 from gym_dgpmpc import options
-from gym_dgpmpc.errors import DGPMPCError
+from gym_dgpmpc.cli.common import (
+    EXIT_INTERRUPTED,
+    EXIT_TERMINATED,
+    make,
+    one_line_errors,
+    plain,
+    prepare_video,
+    use_threads,
+)
 
 if TYPE_CHECKING:
     from gym_dgpmpc.reporting.run import TrainingRun
 
-EXIT_ERROR, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 130, 143
 DEFAULT_EPISODES = 15
 RUN = "Run"
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
-
-def _show_version(value: bool) -> bool:
-    if value:
-        typer.echo(f"dgpmpc {importlib.metadata.version('gym-dgpmpc')}")
-        raise typer.Exit
-    return value
-
-
-@app.callback()
-def main(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
-    ] = False,
-) -> None:
-    """Sample-efficient model-predictive control with deep Gaussian processes."""
-
-
-@app.command()
 def train(
     env_id: Annotated[
         str, typer.Argument(metavar="ENV_ID", help="Gymnasium id of the environment, such as ModCartPole-v0.")
@@ -121,12 +100,14 @@ def train(
     num_samples: options.NumSamples = None,
     sample_spacing: options.SampleSpacing = None,
     resample_steps: options.Resample = None,
+    reward_fn: options.Reward = None,
+    terminated_fn: options.Termination = None,
 ) -> None:
     """Train an agent, and leave results, pictures and the agent itself in a folder.
 
     Options that are not given are as in the paper where it has the environment, else the agent's defaults.
     """
-    asked = _plain(
+    asked = plain(
         num_layers=num_layers,
         kernel=kernel,
         num_inducing=num_inducing,
@@ -147,14 +128,16 @@ def train(
         num_samples=num_samples,
         sample_spacing=sample_spacing,
         resample_steps=resample_steps,
+        reward_fn=reward_fn,
+        terminated_fn=terminated_fn,
         seed=seed,
     )
-    with _one_line_errors(ValueError, AssertionError, OSError):
+    with one_line_errors(ValueError, AssertionError, OSError):
         if episodes is not None and timesteps is not None:
             raise ValueError("give either --episodes or --timesteps, not both")
-        _use_threads(threads)
-        no_video = _prepare_video(env_id) if video else "--no-video was given"
-        env = _make(env_id, render=not no_video)
+        use_threads(threads)
+        no_video = prepare_video(env_id) if video else "--no-video was given"
+        env = make(env_id, render=not no_video)
         run = _set_up_run(env, asked, out, overwrite, episodes, timesteps, checkpoint_every)
     if run.is_complete:
         typer.echo(f"{run.folder.path} holds this run already, finished: ask for more --episodes, or --overwrite it")
@@ -163,7 +146,7 @@ def train(
         typer.echo(f"{run.folder.path} goes on after step {run.agent.num_timesteps}")
     started = time.perf_counter()
     try:
-        with _one_line_errors():
+        with one_line_errors():
             run.train(progress_bar=os.isatty(1) if progress is None else progress)
     except (KeyboardInterrupt, SystemExit) as stop:
         typer.echo(f"\ninterrupted; the same command goes on from the checkpoint in {run.folder.path}")
@@ -179,108 +162,6 @@ def train(
     )
 
 
-@app.command()
-def evaluate(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="A folder of `dgpmpc train`, or an agent's file.")],
-    env_id: Annotated[
-        str | None,
-        typer.Option(
-            "--env",
-            metavar="ENV_ID",
-            help="Gymnasium id of an environment of the same spaces.",
-            show_default="the one trained in",
-        ),
-    ] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="Episodes to play.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the environment's starting states.")] = 1000,
-    threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
-    video: Annotated[
-        Path | None, typer.Option(metavar="FILE.gif", help="Write the last episode as a GIF; needs OpenGL.")
-    ] = None,
-) -> None:
-    """Play episodes with a trained agent, without learning, and report their returns."""
-    from stable_baselines3.common.evaluation import evaluate_policy
-
-    from gym_dgpmpc.agents import MPCAgent
-    from gym_dgpmpc.agents.checkpoint import read_checkpoint
-    from gym_dgpmpc.agents.run_checkpoints import NEWEST
-    from gym_dgpmpc.reporting.recording import Episode, EpisodeRecorder
-    from gym_dgpmpc.reporting.rendering import write_gif
-
-    returns: list[float] = []
-
-    def show(episode: Episode) -> None:
-        returns.append(float(episode.rewards.sum()))
-        typer.echo(f"episode {len(returns):3d} | {len(episode.rewards):6d} steps | return {returns[-1]:9.2f}")
-
-    with _one_line_errors(ValueError, AssertionError, OSError):
-        _use_threads(threads)
-        file = path / NEWEST if path.is_dir() else path
-        env_id = env_id or read_checkpoint(file).config.get("environment")
-        if env_id is None:
-            raise ValueError(f"{file} does not say which environment it was trained in: give --env ENV_ID")
-        no_video = _prepare_video(env_id) if video else "not asked for"
-        recorder = EpisodeRecorder(_make(env_id, render=not no_video), show)
-        agent = MPCAgent.load(file, env=recorder)
-        env = agent.get_env()
-        assert env is not None
-        env.seed(seed)
-    with _one_line_errors():
-        evaluate_policy(agent, env, n_eval_episodes=episodes)
-    typer.echo(f"mean return {sum(returns) / len(returns):.2f}, from {min(returns):.2f} to {max(returns):.2f}")
-    if video is not None and no_video:
-        typer.echo(f"no GIF: {no_video}")
-    elif video is not None and recorder.last is not None:
-        write_gif(recorder.last.frames, video, recorder.last.frames_per_second)
-        typer.echo(f"last episode: {video}")
-
-
-@contextmanager
-def _one_line_errors(*expected: type[Exception]) -> Iterator[None]:
-    """Report this package's errors, Gymnasium's and the ``expected`` ones in one line; others are bugs."""
-    kinds: tuple[type[Exception], ...] = (DGPMPCError, gymnasium.error.Error, *expected)
-    try:
-        yield
-    except kinds as error:
-        typer.echo(f"error: {' '.join(str(error).split()) or _where(error)}", err=True)
-        raise typer.Exit(EXIT_ERROR) from error
-
-
-def _where(error: Exception) -> str:
-    """Kind and place of an error that says nothing, such as a bare assertion in an environment."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{type(error).__name__} at {last.filename}:{last.lineno}: {last.line}"
-
-
-def _plain(**arguments: Any) -> dict[str, Any]:
-    """The arguments with choices as texts."""
-    return {name: value.value if isinstance(value, Enum) else value for name, value in arguments.items()}
-
-
-def _use_threads(threads: int) -> None:
-    import torch
-
-    torch.set_num_threads(threads)
-
-
-def _prepare_video(env_id: str) -> str:
-    """Choose MuJoCo's way to draw off-screen, before MuJoCo is used; the result says why there is none, if so."""
-    from gym_dgpmpc.reporting.rendering import probe_rendering
-
-    _make(env_id, render=False).close()  # so that a mistake in the id is not taken for a missing OpenGL
-    rendering = probe_rendering(env_id)
-    if rendering.mujoco_gl:
-        os.environ["MUJOCO_GL"] = rendering.mujoco_gl
-    return rendering.why_not
-
-
-def _make(env_id: str, *, render: bool) -> gymnasium.Env:
-    try:
-        return gymnasium.make(env_id, render_mode="rgb_array") if render else gymnasium.make(env_id)
-    except ModuleNotFoundError as error:
-        raise ValueError(f"the environment {env_id} needs the Python module {error.name}, which is missing") from error
-
-
 def _set_up_run(
     env: gymnasium.Env,
     asked: dict[str, Any],
@@ -291,6 +172,7 @@ def _set_up_run(
     checkpoint_every: int | None,
 ) -> "TrainingRun":
     """The run that the options describe, with what they leave open filled in."""
+    from gym_dgpmpc.agents import DGPMPCAgent
     from gym_dgpmpc.reporting.run import RunFolder, TrainingRun
 
     assert env.spec is not None
@@ -310,7 +192,7 @@ def _set_up_run(
         run = TrainingRun(
             folder,
             env,
-            arguments,
+            partial(DGPMPCAgent, **arguments),
             num_episodes=episodes,
             total_timesteps=timesteps,
             checkpoint_every=checkpoint_every,

@@ -1,0 +1,94 @@
+"""What matters for the first planned episode: `python -m benchmarks.ablation`.
+
+Every variant learns from the same episode of random actions and then plans the first steps of an episode, so that a
+variant costs a few minutes. Beside the return it says what the plans expected and what was obtained (a planner that
+exploits errors of its model expects more), and how well the model predicts H steps ahead under smoother random actions.
+Writes `ablation.md` and `ablation.json`; what is in the latter already is not done again.
+"""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+
+from benchmarks.calibration import random_episode, score, write_rows
+from gym_dgpmpc import DGPMPCAgent
+from gym_dgpmpc.agents.presets import PAPER
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "default (L = 2)": {},
+    "L = 1": {"num_layers": 1},
+    "L = 1, RBF": {"num_layers": 1, "kernel": "rbf"},
+    "SG-HMC alone": {"gibbs_every": 0, "sample_spacing": 50},
+    "no re-sampling within the episode": {"resample_steps": 0},
+    "one function per particle and plan": {"refresh": "plan"},
+    "1 particle": {"num_particles": 1},
+    "horizon 20": {"horizon": 20},
+    "trained for a quarter as long": {"first_training_iterations": 1000},
+}
+"""Arguments of `DGPMPCAgent` that differ from the paper's settings for the task."""
+
+HORIZONS, TEST_SEEDS = (1, 10, 20, 40), range(5000, 5003)
+
+
+class _Kept(BaseCallback):
+    """Keeps what the agent logs about an episode."""
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.values = dict(self.logger.name_to_value)
+
+
+def measure(variant: str, seed: int, arguments: argparse.Namespace) -> dict[str, Any]:
+    """One model on one random episode, and the first steps it plans."""
+    source = gymnasium.make(arguments.env)
+    data = random_episode(source, seed, 0.0)
+    env = gymnasium.make(arguments.env, max_episode_steps=arguments.steps)
+    agent = DGPMPCAgent(env, seed=seed, **{**PAPER.get(arguments.env, {}), **VARIANTS[variant]})
+    columns = {name: value.numpy() for name, value in data._asdict().items()}
+    agent.add_transitions({**columns, "reward": agent.task.reward_fn(*data).numpy()})
+    agent.learn(0)
+    row: dict[str, Any] = {"variant": variant, "seed": seed}
+    tests = [random_episode(source, test_seed, 0.8) for test_seed in TEST_SEEDS]
+    spread = torch.cat([test.next_observation for test in tests]).std(0)
+    for horizon in HORIZONS:
+        scores = score(agent.dynamics, tests, horizon, torch.Generator().manual_seed(seed), spread=spread)
+        row |= {f"{name}_{horizon}": scores[name] for name in ("error", "coverage_90")}
+    started, kept = time.process_time(), _Kept()
+    agent.learn(arguments.steps, kept, log_interval=sys.maxsize)
+    row["return"] = kept.values["rollout/ep_return"]
+    for name in ("predicted", "obtained"):
+        row[name] = kept.values[f"planner/{name}_reward_per_step"]
+    return row | {"cpu_seconds": time.process_time() - started}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.ablation", description=__doc__)
+    parser.add_argument("--env", default="RiskSensitiveHalfCheetah-v0", help="id of the environment")
+    parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS), metavar="VARIANT")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[100, 101])
+    parser.add_argument("--steps", type=int, default=200, help="planned steps")
+    parser.add_argument("--results", type=Path, default=Path("benchmarks/results/ablation"))
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    saved = arguments.results / "ablation.json"
+    rows = json.loads(saved.read_text())["rows"] if saved.exists() else []
+    done = {(row["variant"], row["seed"]) for row in rows}
+    # Seeds outermost, so that an interrupted benchmark has every variant with some seeds.
+    for seed, variant in ((seed, variant) for seed in arguments.seeds for variant in arguments.variants):
+        if (variant, seed) not in done:
+            rows.append(measure(variant, seed, arguments))
+            write_rows(rows, "ablation", arguments.env, arguments.results)
+    print((arguments.results / "ablation.md").read_text())
+
+
+if __name__ == "__main__":
+    main()

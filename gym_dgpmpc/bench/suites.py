@@ -1,0 +1,204 @@
+"""The suites, as data: which methods run on which tasks, for how many episodes and with which seeds."""
+
+import shlex
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from gym_dgpmpc.bench.jobs import Job
+from gym_dgpmpc.bench.methods import dgp_mpc
+from gym_dgpmpc.bench.run import Run
+from gym_dgpmpc.bench.tasks import TASKS
+from gym_dgpmpc.errors import DGPMPCError
+
+PAPER_TASKS = {"ModCartPole-v0": 15, "BiasedReacher-v0": 15, "RiskSensitiveHalfCheetah-v0": 10}
+"""The tasks of the paper, and the episodes that it plays on each after a random one."""
+PAPER_LAYERS = (1, 2, 3)
+PAPER_KERNELS = ("rbf", "matern52", "matern32", "matern12")
+PAPER_SEEDS = tuple(range(10))
+
+BASELINES = ("PETS TS1", "PETS TSinf", "GP-MM", "GP-DS", "SAC", "TD3", "PPO")
+STOCK_TASKS = {
+    "Pendulum-v1": 6,
+    "Pendulum-v1:learned reward": 6,
+    "InvertedPendulum-v5": 5,
+    "InvertedDoublePendulum-v5": 10,
+    "Reacher-v5": 10,
+    "Swimmer-v5": 10,
+    "FetchReachDense-v4": 10,
+}
+"""Gymnasium's own tasks, and episodes after a random one."""
+STOCK_TIMES = 10
+"""How many times the steps SAC gets there."""
+
+
+class SuiteError(DGPMPCError, ValueError):
+    """There is no such suite, or it has no such task or method."""
+
+
+class Narrowed(NamedTuple):
+    """What of a suite is asked for; None leaves it as it is. Tasks and methods may be patterns, such as "PETS*"."""
+
+    seeds: Sequence[int] | None = None
+    tasks: Sequence[str] | None = None
+    methods: Sequence[str] | None = None
+    episodes: int | None = None
+
+
+@runtime_checkable
+class Suite(Protocol):
+    """Jobs that belong together."""
+
+    @property
+    def title(self) -> str:
+        """On one line, for a person."""
+
+    def jobs(self, narrowed: Narrowed) -> Sequence[Job]:
+        """Those that are asked for.
+
+        Raises:
+            SuiteError: a name that is asked for does not occur.
+        """
+
+
+class Cell(NamedTuple):
+    """One method on one task, with every seed."""
+
+    method: str
+    task: str
+    episodes: int
+    times: int = 1
+    steps_of: str | None = None
+    """These two: see `Run`."""
+
+
+@dataclass(frozen=True)
+class RunSuite:
+    """A suite of runs.
+
+    Attributes:
+        name: on the command line.
+        title: on one line, for a person.
+        cells: methods on tasks.
+        seeds: of each.
+    """
+
+    name: str
+    title: str
+    cells: tuple[Cell, ...]
+    seeds: tuple[int, ...] = PAPER_SEEDS
+
+    def jobs(self, narrowed: Narrowed) -> list[Run]:
+        """The runs, seeds outermost, so that an interrupted suite has every cell with some seeds.
+
+        Raises:
+            SuiteError: a task or a method that is asked for is not in the suite.
+        """
+        tasks = _chosen("task", [cell.task for cell in self.cells], narrowed.tasks)
+        methods = _chosen("method", [cell.method for cell in self.cells], narrowed.methods)
+        cells = [cell for cell in self.cells if cell.task in tasks and cell.method in methods]
+        if not cells:
+            raise SuiteError(f"{self.name} has none of the methods {sorted(methods)} on {sorted(tasks)}")
+        seeds = self.seeds if narrowed.seeds is None else narrowed.seeds
+        return [self._run(cell, seed, narrowed.episodes) for seed in seeds for cell in cells]
+
+    def _run(self, cell: Cell, seed: int, episodes: int | None) -> Run:
+        options = ["--tasks", cell.task, "--methods", cell.method, "--seeds", str(seed)]
+        options += [] if episodes is None else ["--episodes", str(episodes)]
+        return Run(
+            cell.method,
+            TASKS[cell.task],
+            seed,
+            cell.episodes if episodes is None else episodes,
+            cell.times,
+            cell.steps_of,
+            command=shlex.join(["dgpmpc", "bench", self.name, *options]),
+        )
+
+
+def _chosen(what: str, names: Iterable[str], asked: Sequence[str] | None) -> set[str]:
+    """Those of the names that are asked for by name or pattern."""
+    there = sorted(set(names))
+    if asked is None:
+        return set(there)
+    for pattern in asked:
+        if not any(fnmatchcase(name, pattern) for name in there):
+            raise SuiteError(f"there is no {what} {pattern!r} in this suite; there are {', '.join(there)}")
+    return {name for name in there if any(fnmatchcase(name, pattern) for pattern in asked)}
+
+
+def _paper(methods: Iterable[str]) -> tuple[Cell, ...]:
+    """Methods on the paper's tasks."""
+    methods = tuple(methods)
+    return tuple(Cell(method, task, episodes) for task, episodes in PAPER_TASKS.items() for method in methods)
+
+
+def _stock() -> tuple[Cell, ...]:
+    method = dgp_mpc(2, "matern32")
+    planned = [Cell(method, task, episodes) for task, episodes in STOCK_TASKS.items()]
+    # SAC knows no reward function, so to it a task with a learned one is the task itself.
+    model_free = [
+        Cell("SAC", task, episodes, STOCK_TIMES, steps_of=method)
+        for task, episodes in STOCK_TASKS.items()
+        if ":" not in task
+    ]
+    return (*planned, *model_free)
+
+
+_COMPARED = (dgp_mpc(2, "matern32"), dgp_mpc(3, "matern32"), *BASELINES)
+
+SUITES: dict[str, Suite] = {
+    suite.name: suite
+    for suite in (
+        RunSuite(
+            "table",
+            "average episode return by kernel and layers on the paper's three tasks",
+            _paper(dgp_mpc(layers, kernel) for kernel in PAPER_KERNELS for layers in PAPER_LAYERS),
+        ),
+        RunSuite(
+            "comparison",
+            "every method on the paper's three tasks, and the true dynamics as the ceiling",
+            _paper((*_COMPARED, "true dynamics")),
+        ),
+        RunSuite(
+            "variance",
+            "how much the average episode return of every method varies over seeds",
+            _paper(_COMPARED),
+        ),
+        RunSuite(
+            "unmodified",
+            "the cart-pole in the middle of its rail: RBF kernels, and PETS as published",
+            (
+                *(Cell(dgp_mpc(layers, "rbf"), "SwingUpCartPole-v0", 15) for layers in PAPER_LAYERS),
+                Cell("PETS as published", "SwingUpCartPole-v0", 15),
+            ),
+        ),
+        RunSuite(
+            "long-cheetah",
+            "the half cheetah beyond small samples",
+            tuple(
+                Cell(dgp_mpc(layers, "matern32"), "RiskSensitiveHalfCheetah-v0:50 episodes", 50)
+                for layers in PAPER_LAYERS
+            ),
+        ),
+        RunSuite(
+            "stock",
+            f"Gymnasium's own tasks, against SAC with {STOCK_TIMES} times the steps",
+            _stock(),
+            seeds=(0, 1, 2),
+        ),
+    )
+}
+"""By name. A suite of jobs that are not runs is one more entry: an object with a title and `jobs`."""
+
+
+def find_suite(name: str) -> Suite:
+    """The suite of that name.
+
+    Raises:
+        SuiteError: there is none.
+    """
+    if name not in SUITES:
+        raise SuiteError(f"there is no suite {name!r}; there are {', '.join(SUITES)}")
+    return SUITES[name]

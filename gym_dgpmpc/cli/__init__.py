@@ -1,0 +1,38 @@
+"""The command line: `dgpmpc train ENV_ID`, `dgpmpc evaluate PATH` and `dgpmpc bench SUITE`, one module each.
+
+Says what is wrong in one line, with exit code 2; stops with 130 after Ctrl-C and with 143 after SIGTERM. What is slow
+to import is imported when a command runs, so that `--help` answers at once.
+"""
+
+import importlib.metadata
+from typing import Annotated
+
+import typer
+
+import gym_dgpmpc  # noqa: F401  # registers the environments
+from gym_dgpmpc.cli import bench, evaluate, train
+
+COMMANDS = (train.train, evaluate.evaluate, bench.bench)
+"""In the order in which `dgpmpc --help` shows them."""
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+
+def _show_version(value: bool) -> bool:
+    if value:
+        typer.echo(f"dgpmpc {importlib.metadata.version('gym-dgpmpc')}")
+        raise typer.Exit
+    return value
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Sample-efficient model-predictive control with deep Gaussian processes."""
+
+
+for command in COMMANDS:
+    app.command()(command)

@@ -1,0 +1,61 @@
+"""What the commands have in common: errors on one line, exit codes, threads, making an environment."""
+
+import os
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import Enum
+from typing import Any
+
+import gymnasium
+import typer
+
+from gym_dgpmpc.errors import DGPMPCError
+
+EXIT_ERROR, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 130, 143
+
+
+@contextmanager
+def one_line_errors(*expected: type[Exception]) -> Iterator[None]:
+    """Report this package's errors, Gymnasium's and the ``expected`` ones in one line; others are bugs."""
+    kinds: tuple[type[Exception], ...] = (DGPMPCError, gymnasium.error.Error, *expected)
+    try:
+        yield
+    except kinds as error:
+        typer.echo(f"error: {' '.join(str(error).split()) or _where(error)}", err=True)
+        raise typer.Exit(EXIT_ERROR) from error
+
+
+def _where(error: Exception) -> str:
+    """Kind and place of an error that says nothing, such as a bare assertion in an environment."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__} at {last.filename}:{last.lineno}: {last.line}"
+
+
+def plain(**arguments: Any) -> dict[str, Any]:
+    """The arguments with choices as texts."""
+    return {name: value.value if isinstance(value, Enum) else value for name, value in arguments.items()}
+
+
+def use_threads(threads: int) -> None:
+    import torch
+
+    torch.set_num_threads(threads)
+
+
+def prepare_video(env_id: str) -> str:
+    """Choose MuJoCo's way to draw off-screen, before MuJoCo is used; the result says why there is none, if so."""
+    from gym_dgpmpc.reporting.rendering import probe_rendering
+
+    make(env_id, render=False).close()  # so that a mistake in the id is not taken for a missing OpenGL
+    rendering = probe_rendering(env_id)
+    if rendering.mujoco_gl:
+        os.environ["MUJOCO_GL"] = rendering.mujoco_gl
+    return rendering.why_not
+
+
+def make(env_id: str, *, render: bool) -> gymnasium.Env:
+    try:
+        return gymnasium.make(env_id, render_mode="rgb_array") if render else gymnasium.make(env_id)
+    except ModuleNotFoundError as error:
+        raise ValueError(f"the environment {env_id} needs the Python module {error.name}, which is missing") from error

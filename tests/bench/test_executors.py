@@ -1,0 +1,85 @@
+"""Jobs come back from processes, Ray and Dask; the death of a worker costs none of them."""
+
+import pytest
+
+from gym_dgpmpc.bench import executors
+from gym_dgpmpc.bench.executors import ClusterError, executor
+from gym_dgpmpc.bench.jobs import Folders, keep
+from gym_dgpmpc.bench.results import RunResult
+from gym_dgpmpc.bench.run import Run
+from tests.bench.toy import TINY, TOY, Errand, steps_in, toy
+from tests.reporting.toy import EPISODE_STEPS
+
+
+@pytest.fixture
+def folders(tmp_path):
+    return Folders(tmp_path / "results", tmp_path / "work")
+
+
+@pytest.fixture
+def errand(tmp_path):
+    return lambda name, **arguments: Errand(name, str(tmp_path / f"{name}.diary"), **arguments)
+
+
+def outcomes(carry_out_all, jobs, folders):
+    return {job.name: outcome for job, outcome in carry_out_all(jobs, folders)}
+
+
+def test_one_after_the_other_in_this_process(errand, folders):
+    found = list(executor(1)([errand("a"), errand("b", fails=True), errand("c")], folders))
+    assert [job.name for job, _ in found] == ["a", "b", "c"]
+    assert [outcome.content for _, outcome in found] == ["a", None, "c"]
+    assert found[1][1].told == "ValueError: it was not to be"
+    assert "perform" in found[1][1].failure
+
+
+def test_processes_that_die(errand, folders, tmp_path, monkeypatch):
+    monkeypatch.setattr(executors, "RETRIES", 1)
+    jobs = [errand("poison", dies=100), errand("unlucky", dies=1), *(errand(name) for name in "abc")]
+    found = outcomes(executor(2), jobs, folders)
+    assert {name: outcome.content for name, outcome in found.items()} == {
+        "poison": None, "unlucky": "unlucky", "a": "a", "b": "b", "c": "c",
+    }  # fmt: skip
+    assert "TerminatedWorkerError" in found["poison"].told
+    assert steps_in(tmp_path / "unlucky.diary") >= 2
+
+
+@pytest.mark.slow
+def test_a_run_on_ray_whose_worker_is_killed_goes_on(folders, tmp_path):
+    """Two workers, one of them killed in the middle of a run's last episode: both results arrive, the killed one the
+    same as without the kill, and none of its finished episodes was played again."""
+    diary, method = tmp_path / "diary", "DGP-MPC L=1 matern32"
+    killed = Run(method, toy(diary=str(diary), ends_at=2 * EPISODE_STEPS + 4), 0, 2, asked=TINY[method])
+    other = Run(method, TOY, 1, 2, asked=TINY[method])
+    undisturbed = Run(method, TOY, 0, 2, asked=TINY[method])
+    for job, outcome in executor(2, "ray")([killed, other], folders):
+        keep(job, outcome, folders.results)
+        assert outcome.failure is None
+    assert steps_in(diary) == 2 * EPISODE_STEPS + 4 + EPISODE_STEPS
+    undisturbed.perform(Folders(tmp_path / "undisturbed", tmp_path / "undisturbed"))
+    found, _ = (RunResult.read(folders.results / job.file_name) for job in (killed, other))
+    expected = RunResult.read(tmp_path / "undisturbed" / killed.file_name)
+    assert [episode.episode_return for episode in found.episodes] == [
+        episode.episode_return for episode in expected.episodes
+    ]
+
+
+@pytest.mark.slow
+def test_dask_workers_that_die(errand, folders, tmp_path):
+    """More often than Dask itself begins a task again, which is 3 times."""
+    jobs = [errand("unlucky", dies=5), errand("a"), errand("b", fails=True)]
+    found = outcomes(executor(2, "dask"), jobs, folders)
+    assert {name: outcome.content for name, outcome in found.items()} == {"unlucky": "unlucky", "a": "a", "b": None}
+    assert steps_in(tmp_path / "unlucky.diary") == 6
+
+
+@pytest.mark.parametrize("cluster", ["rays", "http://a:1", ""])
+def test_addresses_of_no_cluster(cluster):
+    with pytest.raises(ClusterError, match="a cluster is ray, ray://HOST:PORT, dask or tcp://HOST:PORT, got"):
+        executor(1, cluster)
+
+
+def test_what_is_not_installed_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
+    with pytest.raises(ClusterError, match=r"pip install 'gym-dgpmpc\[dask\]'"):
+        executor(1, "dask")

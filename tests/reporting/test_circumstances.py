@@ -1,0 +1,64 @@
+"""What results say of the code that made them is true."""
+
+import shutil
+import subprocess
+
+import pytest
+
+from gym_dgpmpc.reporting import circumstances
+from gym_dgpmpc.reporting.circumstances import UNKNOWN, machine, revision, versions
+
+
+@pytest.fixture
+def package(tmp_path):
+    """A package in a repository with one commit."""
+    folder = tmp_path / "package"
+    folder.mkdir()
+    (folder / "__init__.py").write_text("")
+    (tmp_path / "results.csv").write_text("")
+    git(tmp_path, "init", "--quiet")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "-c", "user.name=a", "-c", "user.email=a@b", "commit", "--quiet", "--message", "one")
+    return folder
+
+
+def git(folder, *arguments):
+    return subprocess.run(["git", *arguments], cwd=folder, check=True, capture_output=True, text=True).stdout.strip()
+
+
+needs_git = pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
+
+
+@needs_git
+def test_the_commit_and_whether_the_package_differs_from_it(package):
+    commit = git(package, "rev-parse", "HEAD")
+    assert revision(package) == commit
+    (package.parent / "results.csv").write_text("more")
+    assert revision(package) == commit
+    (package / "new.py").write_text("")
+    assert revision(package) == f"{commit}-dirty"
+    (package / "new.py").unlink()
+    (package / "__init__.py").write_text("changed")
+    assert revision(package) == f"{commit}-dirty"
+
+
+@needs_git
+def test_a_package_installed_in_a_repository_is_not_of_it(package):
+    installed = package.parent / "lib" / "another"
+    installed.mkdir(parents=True)
+    assert revision(installed) == UNKNOWN
+
+
+def test_without_a_repository_or_git(tmp_path, monkeypatch):
+    assert revision(tmp_path) == UNKNOWN
+
+    def missing(*args, **kwargs):
+        raise FileNotFoundError("git")
+
+    monkeypatch.setattr(circumstances.subprocess, "run", missing)
+    assert revision() == UNKNOWN
+
+
+def test_versions_and_machine():
+    assert set(versions()) == {"python", *circumstances.PACKAGES}
+    assert machine()["threads"] == 1
