@@ -326,11 +326,11 @@ def _set_up_run(
 def _fill_in(env_id: str, asked: dict[str, Any]) -> dict[str, Any]:
     """Every argument as asked, else as in the paper's preset for the environment, else as the agent has it."""
     from gym_dgpmpc.agents import DGPMPCAgent
-    from gym_dgpmpc.agents.presets import PAPER
+    from gym_dgpmpc.agents.presets import settings_for
 
     parameters = inspect.signature(DGPMPCAgent).parameters
     filled = {name: parameters[name].default for name in asked}
-    filled |= PAPER.get(env_id, {})
+    filled |= settings_for(env_id)
     if asked["num_candidates"] is not None:
         filled["num_elites"] = None  # the preset's elites are a part of the preset's candidates
     return filled | {name: value for name, value in asked.items() if value is not None}
