@@ -54,7 +54,7 @@ def _stock(**settings: Any) -> MappingProxyType[str, Any]:
 STOCK = MappingProxyType(
     {
         "Pendulum-v1": _stock(
-            num_inducing=100, horizon=25, num_candidates=200, num_iterations=4, num_samples=100, sample_spacing=10
+            num_inducing=100, horizon=30, num_candidates=300, num_iterations=5, num_samples=100, sample_spacing=10
         ),
         "Reacher-v5": _stock(num_inducing=100, horizon=15, num_candidates=200, num_iterations=4, learning_starts=150),
         "FetchReachDense-v4": _stock(
