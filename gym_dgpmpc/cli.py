@@ -124,7 +124,8 @@ def train(
 ) -> None:
     """Train an agent, and leave results, pictures and the agent itself in a folder.
 
-    Options that are not given are as in the paper where it has the environment, else the agent's defaults.
+    Options that are not given are as in the paper where it has the environment, or as in this package's presets for
+    tasks of Gymnasium's own, else the agent's defaults.
     """
     asked = _plain(
         num_layers=num_layers,
@@ -324,7 +325,7 @@ def _set_up_run(
 
 
 def _fill_in(env_id: str, asked: dict[str, Any]) -> dict[str, Any]:
-    """Every argument as asked, else as in the paper's preset for the environment, else as the agent has it."""
+    """Every argument as asked, else as in the preset for the environment, else as the agent has it."""
     from gym_dgpmpc.agents import DGPMPCAgent
     from gym_dgpmpc.agents.presets import settings_for
 

@@ -56,6 +56,9 @@ STOCK = MappingProxyType(
         "Pendulum-v1": _stock(
             num_inducing=100, horizon=30, num_candidates=300, num_iterations=5, num_samples=100, sample_spacing=10
         ),
+        "InvertedDoublePendulum-v5": _stock(
+            num_inducing=100, horizon=10, num_candidates=300, num_iterations=5, learning_starts=200
+        ),
         "Reacher-v5": _stock(num_inducing=100, horizon=15, num_candidates=200, num_iterations=4, learning_starts=150),
         "FetchReachDense-v4": _stock(
             num_inducing=64, horizon=8, num_candidates=100, num_iterations=3, learning_starts=100
