@@ -56,6 +56,9 @@ STOCK = MappingProxyType(
         "Pendulum-v1": _stock(
             num_inducing=100, horizon=30, num_candidates=300, num_iterations=5, num_samples=100, sample_spacing=10
         ),
+        "InvertedPendulum-v5": _stock(
+            num_inducing=100, horizon=15, num_candidates=200, num_iterations=5, learning_starts=150
+        ),
         "InvertedDoublePendulum-v5": _stock(
             num_inducing=100, horizon=10, num_candidates=300, num_iterations=5, learning_starts=200
         ),
@@ -69,8 +72,8 @@ STOCK = MappingProxyType(
 
 Horizons are long enough for what a task is about (half a swing of the pendulum, a reach) and no longer, because a plan
 that is not corrected on its way cannot balance for long: that of the double pendulum is half a second. The horizons of
-Pendulum-v1 and Reacher-v5 were tried with the true dynamics first, the others in single runs; all with seed 100. Episodes
-that end early teach little, hence the numbers of random steps. docs/environments.md has what they earn.
+Pendulum-v1 and Reacher-v5 were tried with the true dynamics first, the others in single runs; all with seed 100.
+Episodes that end early teach little, hence the numbers of random steps. docs/environments.md has what they earn.
 """
 
 
