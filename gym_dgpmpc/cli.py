@@ -124,8 +124,7 @@ def train(
 ) -> None:
     """Train an agent, and leave results, pictures and the agent itself in a folder.
 
-    Options that are not given are as in the paper where it has the environment, or as in this package's presets for
-    tasks of Gymnasium's own, else the agent's defaults.
+    Options that are not given are as in the preset for ENV_ID (the paper's if it has one), else the agent's defaults.
     """
     asked = _plain(
         num_layers=num_layers,
