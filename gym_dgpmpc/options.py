@@ -56,25 +56,29 @@ _REFRESH = "With pathwise draws: new functions at each step of a plan, or one fo
 
 NumLayers = Annotated[int | None, _model("--layers", "Layers of the deep GP.", "2")]
 Kernel = Annotated[KernelName | None, _model("--kernel", "Covariance function of every layer.", "matern32", None)]
-NumInducing = Annotated[int | None, _model("--inducing", "Inducing points per layer.", "200")]
+NumInducing = Annotated[
+    int | None, _model("--inducing", "Inducing points per layer.", "200, or the preset's for ENV_ID")
+]
 Draw = Annotated[DrawName | None, _model("--draw", _DRAW, "pathwise", None)]
 Refresh = Annotated[RefreshName | None, _model("--refresh", _REFRESH, "step", None)]
 NumFeatures = Annotated[int | None, _model("--features", "Random features of a pathwise draw.", "128")]
 
 NumParticles = Annotated[int | None, _planner("--particles", "Worlds that a plan's return is averaged over.", "5")]
 Horizon = Annotated[
-    int | None, _planner("--horizon", "Environment steps that a plan looks ahead.", "30, or the paper's for ENV_ID")
+    int | None, _planner("--horizon", "Environment steps that a plan looks ahead.", "30, or the preset's for ENV_ID")
 ]
-NumCandidates = Annotated[int | None, _planner("--candidates", "Action sequences tried in each iteration.", "300")]
+NumCandidates = Annotated[
+    int | None, _planner("--candidates", "Action sequences tried in each iteration.", "300, or the preset's for ENV_ID")
+]
 NumElites = Annotated[
     int | None,
     _planner("--elites", "The best of them, which the next iteration starts from.", "a tenth of the candidates"),
 ]
 NumIterations = Annotated[
-    int | None, _planner("--iterations", "Iterations of a plan, at most.", "5, or the paper's for ENV_ID")
+    int | None, _planner("--iterations", "Iterations of a plan, at most.", "5, or the preset's for ENV_ID")
 ]
 ActionsPerPlan = Annotated[
-    int | None, _planner("--actions-per-plan", "Actions performed of each plan.", "1, or the paper's for ENV_ID")
+    int | None, _planner("--actions-per-plan", "Actions performed of each plan.", "1, or the preset's for ENV_ID")
 ]
 
 TimeBudget = Annotated[
@@ -88,24 +92,40 @@ TimeBudget = Annotated[
 ]
 
 LearningStarts = Annotated[
-    int | None, _training("--random-steps", "Environment steps of random actions at first.", "those of one episode")
+    int | None,
+    _training(
+        "--random-steps",
+        "Environment steps of random actions at first.",
+        "those of one episode, or the preset's for ENV_ID",
+    ),
 ]
 TrainFreq = Annotated[
     int | None, _training("--train-freq", "Environment steps between two trainings.", "one at every episode's start")
 ]
 FirstTraining = Annotated[
     int | None,
-    _training("--first-training", "Iterations of the first training.", "4000"),
+    _training("--first-training", "Iterations of the first training.", "4000, or the preset's for ENV_ID"),
 ]
 Training = Annotated[
-    int | None, _training("--training", "Iterations of each later training, at every episode's start.", "1000")
+    int | None,
+    _training(
+        "--training", "Iterations of each later training, at every episode's start.", "1000, or the preset's for ENV_ID"
+    ),
 ]
 NumSamples = Annotated[
-    int | None, _training("--samples", "Posterior samples kept, from which a plan's worlds are drawn.", "100")
+    int | None,
+    _training(
+        "--samples", "Posterior samples kept, from which a plan's worlds are drawn.", "100, or the preset's for ENV_ID"
+    ),
 ]
-SampleSpacing = Annotated[int | None, _training("--spacing", "Sampler steps between two kept samples.", "10")]
+SampleSpacing = Annotated[
+    int | None, _training("--spacing", "Sampler steps between two kept samples.", "10, or the preset's for ENV_ID")
+]
 Resample = Annotated[
-    int | None, _training("--resample", "Sampler steps on the grown data after each control step.", "10", 0)
+    int | None,
+    _training(
+        "--resample", "Sampler steps on the grown data after each control step.", "10, or the preset's for ENV_ID", 0
+    ),
 ]
 
 _REWARD = "Whether the model learns to predict the reward, even where it is known."

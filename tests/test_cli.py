@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from gym_dgpmpc import cli, options
 from gym_dgpmpc.agents import DGPMPCAgent
 from gym_dgpmpc.agents.checkpoint import read_checkpoint
-from gym_dgpmpc.agents.presets import PAPER
+from gym_dgpmpc.agents.presets import PAPER, STOCK
 from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
 from gym_dgpmpc.dynamics.deep_gp_draws import DRAWS, REFRESHES
 from gym_dgpmpc.gp.kernels import KERNELS
@@ -109,6 +109,14 @@ def test_timesteps_and_default_folder(run, tmp_path):
     assert result.exit_code == 0, result.output
     assert "20 environment steps" in result.stdout
     assert (tmp_path / "runs" / "ToyPush-v0-seed3" / "agent.zip").exists()
+
+
+def test_settings_of_a_stock_task_are_taken_unless_others_are_asked_for(run, tmp_path):
+    result = run("train", "Pendulum-v1", "--no-video", "--timesteps", 2, "--candidates", 50, "--out", "a")
+    assert result.exit_code == 0, result.output
+    settings = json.loads((tmp_path / "a" / "settings.json").read_text())["settings"]
+    expected = {**STOCK["Pendulum-v1"], "num_candidates": 50}
+    assert expected == {name: settings[name] for name in expected}
 
 
 def test_same_seed_same_run(run, tmp_path):
@@ -292,7 +300,7 @@ def test_options_show_the_agents_defaults_and_the_presets():
         default = arguments[name].default
         assert inspect.signature(cli.train.train).parameters[name].default is None
         assert default is None or shown.split(",")[0] == str(default)
-        presets = {preset[name] for preset in PAPER.values() if name in preset}
+        presets = {preset[name] for preset in (*PAPER.values(), *STOCK.values()) if name in preset}
         assert ("ENV_ID" in shown) == bool(presets - {default}) or name == "num_elites"
     assert options_of_the_agent["num_elites"] == "a tenth of the candidates"
     assert all(10 * preset["num_elites"] == preset["num_candidates"] for preset in PAPER.values())

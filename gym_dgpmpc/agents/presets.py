@@ -1,5 +1,6 @@
 """Settings as data: keyword arguments of an agent for a task, by the environment's id."""
 
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -34,6 +35,58 @@ PAPER = MappingProxyType(
     }
 )
 """The planning settings of Gadd et al. (2020); layers and kernel are what the paper compares, so they are not here."""
+
+
+def _stock(**settings: Any) -> MappingProxyType[str, Any]:
+    """Of a task of Gymnasium's own: what all have in common, and ``settings``."""
+    common = {
+        "num_layers": 2,
+        "num_particles": 5,
+        "first_training_iterations": 1500,
+        "training_iterations": 500,
+        "num_samples": 50,
+        "sample_spacing": 5,
+        "resample_steps": 2,
+    }
+    return MappingProxyType({**common, **settings})
+
+
+STOCK = MappingProxyType(
+    {
+        "Pendulum-v1": _stock(
+            num_inducing=100, horizon=30, num_candidates=300, num_iterations=5, num_samples=100, sample_spacing=10
+        ),
+        "InvertedPendulum-v5": _stock(
+            num_inducing=100, horizon=15, num_candidates=200, num_iterations=5, learning_starts=150
+        ),
+        "InvertedDoublePendulum-v5": _stock(
+            num_inducing=100, horizon=10, num_candidates=300, num_iterations=5, learning_starts=200
+        ),
+        "Reacher-v5": _stock(num_inducing=100, horizon=15, num_candidates=200, num_iterations=4, learning_starts=150),
+        "FetchReachDense-v4": _stock(
+            num_inducing=64, horizon=8, num_candidates=100, num_iterations=3, learning_starts=100
+        ),
+    }
+)
+"""Settings of `DGPMPCAgent` for tasks of Gymnasium and Gymnasium-Robotics, the latter without the module before the id.
+
+Horizons are long enough for what a task is about (half a swing of the pendulum, a reach) and no longer, because a plan
+that is not corrected on its way cannot balance for long: that of the double pendulum is half a second. The horizons of
+Pendulum-v1 and Reacher-v5 were tried with the true dynamics first, the others in single runs; all with seed 100.
+Episodes that end early teach little, hence the numbers of random steps. docs/environments.md has what they earn.
+"""
+
+
+def settings_for(env_id: str) -> Mapping[str, Any]:
+    """Settings of `DGPMPCAgent` for a task: the paper's if it has the task, else those of `STOCK`, else none.
+
+    Args:
+        env_id: id of the environment, with or without a module before it that registers it
+            ("gym_dgpmpc.envs.robotics:FetchReachDense-v4").
+    """
+    name = env_id.rpartition(":")[2]
+    return PAPER.get(name) or STOCK.get(name) or {}
+
 
 REAL_TIME = MappingProxyType(
     {"ModCartPole-v0": MappingProxyType({"num_candidates": 192, "num_elites": 19, "num_iterations": 4})}

@@ -105,7 +105,7 @@ def train(
 ) -> None:
     """Train an agent, and leave results, pictures and the agent itself in a folder.
 
-    Options that are not given are as in the paper where it has the environment, else the agent's defaults.
+    Options that are not given are as in the preset for ENV_ID (the paper's if it has one), else the agent's defaults.
     """
     asked = plain(
         num_layers=num_layers,
@@ -206,13 +206,13 @@ def _set_up_run(
 
 
 def _fill_in(env_id: str, asked: dict[str, Any]) -> dict[str, Any]:
-    """Every argument as asked, else as in the paper's preset for the environment, else as the agent has it."""
+    """Every argument as asked, else as in the preset for the environment, else as the agent has it."""
     from gym_dgpmpc.agents import DGPMPCAgent
-    from gym_dgpmpc.agents.presets import PAPER
+    from gym_dgpmpc.agents.presets import settings_for
 
     parameters = inspect.signature(DGPMPCAgent).parameters
     filled = {name: parameters[name].default for name in asked}
-    filled |= PAPER.get(env_id, {})
+    filled |= settings_for(env_id)
     if asked["num_candidates"] is not None:
         filled["num_elites"] = None  # the preset's elites are a part of the preset's candidates
     return filled | {name: value for name, value in asked.items() if value is not None}

@@ -30,6 +30,24 @@ def truncated_normal(
     return noise.clamp_(-TRUNCATION, TRUNCATION)
 
 
+def elite_shares(scores: Float[Tensor, " K"], num_elites: int) -> Float[Tensor, " K"]:
+    """How much each candidate counts among the elites; the shares sum to one, or to zero if no score is finite.
+
+    The best ``num_elites`` count alike. Those that tie for the last places share them: where a score counts steps
+    survived most candidates tie, and any few picked among them would drag the mean about and narrow the spread where
+    the objective says nothing. A score that is not finite has no share.
+    """
+    # topk ranks NaN highest, hence the replacement before it.
+    ranked = scores.masked_fill(~scores.isfinite(), -math.inf)
+    best = ranked.topk(num_elites).values
+    valid = best.isfinite()
+    last = best.masked_fill(~valid, math.inf).min()
+    above, tied = ranked > last, ranked == last
+    places = valid.sum() - above.sum()
+    share = above.to(scores.dtype) + tied.to(scores.dtype) * (places / tied.sum().clamp(min=1))
+    return share / valid.sum().clamp(min=1)
+
+
 class CEM:
     """Cross-entropy method: sample sequences, keep the best, fit a diagonal Gaussian to them, repeat.
 
@@ -104,7 +122,7 @@ class CEM:
         """Maximise ``objective`` from ``plan``.
 
         A score that is not finite counts as minus infinity and is never an elite; with fewer finite scores than
-        elites, the finite ones alone are fitted.
+        elites, the finite ones alone are fitted. Candidates that tie for the last places share them.
 
         Args:
             deadline: a time of `time.perf_counter`. No iteration begins that would not end by then, were it as slow as
@@ -130,25 +148,23 @@ class CEM:
             noise = truncated_normal(shape, generator, device=low.device, dtype=low.dtype)
             candidates = (mean + std * noise).clamp(low, high)
 
-            # Score them and select the elites. topk ranks NaN highest, hence the replacement before it.
+            # Score them and select the elites.
             scores = objective(candidates)
             if scores.shape != (self.num_candidates,):
                 raise ValueError(f"the objective must return shape ({shape[0]},), got {tuple(scores.shape)}")
             finite = scores.isfinite()
-            elite_scores, elite_index = scores.masked_fill(~finite, -math.inf).topk(self.num_elites)
-            valid = elite_scores.isfinite()
-            weight = (valid / valid.sum().clamp(min=1)).to(low.dtype)
-            elites = candidates[elite_index]
+            share = elite_shares(scores, self.num_elites)
+            weight = share.to(low.dtype)
 
             # Refit: m <- a m + (1 - a) mean(elites), v <- a v + (1 - a) var(elites), population variance.
-            elite_mean = torch.einsum("e,eha->ha", weight, elites)
-            elite_variance = torch.einsum("e,eha->ha", weight, (elites - elite_mean).square())
+            elite_mean = torch.einsum("k,kha->ha", weight, candidates)
+            elite_variance = torch.einsum("k,kha->ha", weight, (candidates - elite_mean).square())
             mean = self.smoothing * mean + (1.0 - self.smoothing) * elite_mean
             variance = self.smoothing * variance + (1.0 - self.smoothing) * elite_variance
 
             # All that the host must know, in its one synchronisation of the iteration.
             narrow = (variance.sqrt() < self.min_std * (high - low)).all()
-            value = elite_scores.masked_fill(~valid, 0.0).sum() / valid.sum()
+            value = (share * scores.masked_fill(~finite, 0.0)).sum()
             num_finite, is_narrow, expected_return = torch.stack([finite.sum(), narrow, value]).tolist()
             num_nonfinite += self.num_candidates - int(num_finite)
             if num_finite == 0:

@@ -8,7 +8,7 @@ import scipy.stats
 import torch
 
 from gym_dgpmpc.planning import CEM, rollout_objective
-from gym_dgpmpc.planning.cem import truncated_normal
+from gym_dgpmpc.planning.cem import elite_shares, truncated_normal
 from gym_dgpmpc.types import Plan
 from tests.oracles import lqr
 
@@ -96,6 +96,33 @@ def test_fewer_finite_scores_than_elites_are_all_the_elites():
     torch.testing.assert_close(plan.std, seen[0][finite].std(dim=0, correction=0))
     assert info.num_nonfinite == 17
     assert info.expected_return == pytest.approx(-1e30)
+
+
+@pytest.mark.parametrize(
+    ("scores", "shares"),
+    [
+        ([3.0, 1.0, 2.0, 0.0], [1 / 2, 0, 1 / 2, 0]),
+        ([3.0, 2.0, 2.0, 0.0], [1 / 2, 1 / 4, 1 / 4, 0]),
+        ([2.0, 2.0, 2.0, 2.0], [1 / 4, 1 / 4, 1 / 4, 1 / 4]),
+        ([2.0, math.nan, 2.0, 2.0], [1 / 3, 0, 1 / 3, 1 / 3]),
+        ([math.inf, math.nan, -math.inf, -5.0], [0, 0, 0, 1]),
+        ([math.nan] * 4, [0, 0, 0, 0]),
+    ],
+)
+def test_candidates_that_tie_share_the_last_places(scores, shares):
+    torch.testing.assert_close(elite_shares(torch.tensor(scores), 2), torch.tensor(shares, dtype=torch.float32))
+
+
+def test_a_flat_objective_neither_moves_nor_narrows_the_plan():
+    """Of K = 400 candidates of standard deviation s the mean errs by s / sqrt(K), their spread by less.
+
+    Any 10 of them would err by s / sqrt(10), which is six times as much.
+    """
+    cem = CEM(**bounds([-1.0], [1.0]), horizon=8, num_candidates=400, num_elites=10, num_iterations=1, smoothing=0.0)
+    spread = 0.5 * scipy.stats.truncnorm(-2.0, 2.0).std()
+    plan, _ = cem.plan(lambda actions: torch.ones(400), cem.initial_plan(), seeded())
+    assert plan.mean.abs().max() < 5 * spread / math.sqrt(400)
+    assert (plan.std - spread).abs().max() < 5 * spread / math.sqrt(400)
 
 
 @pytest.mark.parametrize(("min_std", "expected"), [(0.0, 5), (1.0, 1)])
