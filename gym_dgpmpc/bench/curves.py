@@ -63,7 +63,7 @@ def _latest_mean(returns: Float[ndarray, " E"]) -> Float[ndarray, " E"]:
     return (sums[until] - sums[since]) / (until - since)
 
 
-def _thin(grid: Float[ndarray, " T"]) -> Float[ndarray, " T"]:
+def _thin(grid: Float[ndarray, " T"]) -> Float[ndarray, " kept"]:
     """At most some 150 points, denser at the beginning, where most is learned; the first and the last among them."""
     if len(grid) <= 150:
         return grid

@@ -15,8 +15,9 @@ from gym_dgpmpc.bench.statistics import CONFIDENCE, RESAMPLES
 LEGEND = (
     f"Numbers in square brackets are {CONFIDENCE:.0%} percentile bootstrap intervals over seeds, stratified by task "
     f"({RESAMPLES:,} resamples); ± is the standard deviation over seeds. An interval never leaves the range of the "
-    "runs: with 3 seeds it misses the mean of a symmetric distribution at least one time in 4, with 5 one in 16, with "
-    "10 one in 512; one seed has no interval. Random episodes count as environment steps and as time, never as returns."
+    "runs, and of 2 or 3 seeds it is that range: with 3 seeds it misses the mean of a symmetric distribution at least "
+    "one time in 4, with 5 one in 16, with 10 one in 512. One seed has no interval. Random episodes count as "
+    "environment steps and as time, never as returns."
 )
 
 

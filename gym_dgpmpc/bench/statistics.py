@@ -22,7 +22,7 @@ SEED = 0
 TRIMMED = 0.25
 """Share that the interquartile mean leaves out at each end."""
 
-Strata = Sequence[Float[ndarray, " n"]]
+Strata = Sequence[Float[ndarray, " _"]]
 """One sample per task: a number for each run."""
 
 
@@ -111,11 +111,11 @@ def time_to_reach(times: Sequence[float], reached: Sequence[bool]) -> Passage:
 
 
 def _mean(*strata: ndarray, axis: int) -> ndarray:
-    return np.mean([sample.mean(axis) for sample in strata], axis=0)
+    return np.asarray(np.mean([sample.mean(axis) for sample in strata], axis=0))
 
 
 def _iqm(*strata: ndarray, axis: int) -> ndarray:
-    return stats.trim_mean(np.concatenate(strata, axis), TRIMMED, axis)
+    return np.asarray(stats.trim_mean(np.concatenate(strata, axis), TRIMMED, axis))
 
 
 def _improvement(*strata: ndarray, axis: int) -> ndarray:
@@ -124,7 +124,7 @@ def _improvement(*strata: ndarray, axis: int) -> ndarray:
     for x, y in zip(strata[: len(strata) // 2], strata[len(strata) // 2 :], strict=True):
         first, second = np.moveaxis(x, axis, -1)[..., :, None], np.moveaxis(y, axis, -1)[..., None, :]
         wins.append(((first > second) + 0.5 * (first == second)).mean((-2, -1)))
-    return np.mean(wins, axis=0)
+    return np.asarray(np.mean(wins, axis=0))
 
 
 def _estimate(strata: Strata, statistic: Callable[..., ndarray]) -> Estimate:
@@ -140,7 +140,7 @@ def _estimate(strata: Strata, statistic: Callable[..., ndarray]) -> Estimate:
 def _interval(
     samples: tuple[ndarray, ...], statistic: Callable[..., ndarray], axis: int, batch: int | None = None
 ) -> tuple[ndarray, ndarray]:
-    return stats.bootstrap(
+    interval = stats.bootstrap(
         samples,
         statistic,
         axis=axis,
@@ -151,3 +151,4 @@ def _interval(
         method="percentile",
         rng=SEED,
     ).confidence_interval
+    return np.asarray(interval.low), np.asarray(interval.high)

@@ -173,7 +173,7 @@ def time_table(runs: Runs) -> list[str]:
     return table(header, rows)
 
 
-def at_equal_steps(runs: Runs) -> tuple[dict[str, Sequence[RunResult]], dict[str, Float[ndarray, " n"]]]:
+def at_equal_steps(runs: Runs) -> tuple[dict[str, Sequence[RunResult]], dict[str, Float[ndarray, " _"]]]:
     """The methods whose runs all have an episode by the common number of steps, and their means; no ceiling."""
     steps = scores.common_steps(runs)
     returns = {method: scores.mean_returns(results, steps) for method, results in runs.items() if method != CEILING}
