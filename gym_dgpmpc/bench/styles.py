@@ -24,8 +24,9 @@ def styles(methods: Iterable[str], reference: Iterable[str] = ()) -> dict[str, S
     """A look for each method: the known ones' own, the references' that of the package's method, the rest in turn."""
     names = list(dict.fromkeys(methods))
     as_known = {name: OURS if name in set(reference) else name for name in names}
-    free = [i for i, name in enumerate(KNOWN) if name not in as_known.values()] or [*range(len(KNOWN))]
-    looks, turn = {}, 0
+    unused = [i for i, name in enumerate(KNOWN) if name not in as_known.values()]
+    free = unused or [*range(len(KNOWN))]
+    looks, turn = {}, 0 if unused else len(free)
     for name in names:
         if as_known[name] in KNOWN:
             index = KNOWN.index(as_known[name])

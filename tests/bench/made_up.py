@@ -31,8 +31,8 @@ def run(
         succeeded = None if success is None else success[index]
         episodes.append(Episode("planned", value, length, total, seconds, succeeded))
     return RunResult(
-        RunKey(method, task, seed), tuple(episodes), {"horizon": 30}, milliseconds, f"2026-01-0{seed + 1}T00:00:00+00:00",
-        command, revision, versions or {"python": "3.11", "numpy": "2.0"}, {"cores": 2},
+        RunKey(method, task, seed), tuple(episodes), {"horizon": 30}, milliseconds,
+        f"2026-01-0{seed + 1}T00:00:00+00:00", command, revision, versions or {"python": "3.11", "numpy": "2.0"}, {"cores": 2},
     )  # fmt: skip
 
 

@@ -47,7 +47,8 @@ def test_paper_table():
 def test_comparison_at_equal_steps():
     runs = grouped(
         run(OWN, [1.0, 3.0], random=-50.0), run(OWN, [3.0, 5.0], seed=1, random=-50.0),
-        run("SAC", [0.0, 1.0, 2.0] + [100.0] * 20), run("true dynamics", [9.0] * 5), run("true dynamics", [7.0], seed=1),
+        run("SAC", [0.0, 1.0, 2.0] + [100.0] * 20), run("true dynamics", [9.0] * 5),
+        run("true dynamics", [7.0], seed=1),
     )["Pendulum-v1"]  # fmt: skip
     found = cells(tables.comparison_table(runs))
     assert list(found)[1:] == [OWN, "SAC", "*true dynamics* (all its episodes)"]
