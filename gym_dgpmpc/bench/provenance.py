@@ -1,6 +1,9 @@
 """What runs were made with: every table and figure of a report says which seeds, commands, revisions and versions."""
 
-from collections.abc import Iterable, Mapping
+import itertools
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from gym_dgpmpc.bench.markdown import cell, table
@@ -11,60 +14,60 @@ SECTION = "What the runs were made with"
 
 
 class Origin(NamedTuple):
-    """What runs have in common that one command made in one place."""
+    """What runs have in common that the same source made in the same surroundings."""
 
-    command: str
     revision: str
     versions: tuple[tuple[str, str], ...]
     machine: tuple[tuple[str, str], ...]
 
     @classmethod
     def of(cls, result: RunResult) -> "Origin":
-        return cls(result.command, result.revision, _sorted(result.versions), _sorted(result.machine))
+        return cls(result.revision, _sorted(result.versions), _sorted(result.machine))
 
 
 class Origins:
     """Letters for the origins of a set of runs, in the order in which they are met."""
 
     def __init__(self, study: Mapping[str, Runs]) -> None:
-        results = [result for runs in study.values() for of_method in runs.values() for result in of_method]
-        self._letters: dict[Origin, str] = {}
-        for result in results:
-            self._letters.setdefault(Origin.of(result), _letters(len(self._letters)))
-        self._results = results
+        self._runs: dict[Origin, list[RunResult]] = {}
+        for runs in study.values():
+            for result in itertools.chain(*runs.values()):
+                self._runs.setdefault(Origin.of(result), []).append(result)
+        self._letters = {origin: _letters(place) for place, origin in enumerate(self._runs)}
 
     def caption(self, runs: Runs) -> str:
         """Seeds and origins of the runs behind a table or figure, and whether their revisions or versions differ."""
-        results = [result for of_method in runs.values() for result in of_method]
-        origins = sorted({Origin.of(result) for result in results}, key=self._order)
+        met = {Origin.of(result) for result in itertools.chain(*runs.values())}
+        origins = [origin for origin in self._letters if origin in met]
         letters = ", ".join(self._letters[origin] for origin in origins)
-        anchor = SECTION.lower().replace(" ", "-")
-        text = f"{_seeds(runs)} Made with [{letters}](#{anchor})."
+        text = f"{_seeds(runs)} Made with [{letters}](#{SECTION.lower().replace(' ', '-')})."
         return text + (" **Their revisions or versions differ.**" if _differing(origins) else "")
 
     def lines(self) -> list[str]:
         """The section that says what each letter stands for."""
         rows = []
-        for origin, letter in self._letters.items():
-            runs = sum(Origin.of(result) == origin for result in self._results)
-            started = sorted(result.started for result in self._results if Origin.of(result) == origin)
-            rows.append(
-                [
-                    letter, str(runs), f"`{cell(origin.command)}`", f"`{cell(origin.revision)}`",
-                    _pairs(origin.versions), _pairs(origin.machine), f"{started[0][:10]} to {started[-1][:10]}",
-                ]
-            )  # fmt: skip
+        for origin, results in self._runs.items():
+            started = sorted(result.started[:10] for result in results)
+            rows.append([
+                self._letters[origin], str(len(results)), _commands(results), f"`{cell(origin.revision)}`",
+                _pairs(origin.versions), _pairs(origin.machine), f"{started[0]} to {started[-1]}",
+            ])  # fmt: skip
         differing = _differing(list(self._letters))
         return [
             f"## {SECTION}",
             "",
             f"Not the same in all runs: {differing}." if differing else "All runs have the same revision and versions.",
+            "Each run's own command, with its seed and all its settings, is in its file.",
             "",
-            *table(["", "runs", "command", "revision", "versions", "machine", "started"], rows),
+            *table(["", "runs", "commands", "revision", "versions", "machine", "started"], rows),
         ]
 
-    def _order(self, origin: Origin) -> int:
-        return list(self._letters).index(origin)
+
+def _commands(results: Sequence[RunResult]) -> str:
+    """The commands without their options, and how many runs each made: "`dgpmpc bench table …` (36)"."""
+    heads = Counter(re.split(r"\s--", result.command)[0] for result in results)
+    options = {re.split(r"\s--", result.command)[0] for result in results if re.search(r"\s--", result.command)}
+    return ", ".join(f"`{cell(head)}{' …' if head in options else ''}` ({count})" for head, count in heads.items())
 
 
 def _seeds(runs: Runs) -> str:

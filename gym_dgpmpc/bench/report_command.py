@@ -7,6 +7,10 @@ from typing import Annotated
 
 import typer
 
+from gym_dgpmpc.errors import DGPMPCError
+
+EXIT_ERROR = 2
+
 
 def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A folder of result files, as `dgpmpc bench` writes.")],
@@ -40,14 +44,12 @@ def report(
     thresholds = dict(map(_threshold, threshold or ()))
     options = {"--out": [str(out)], "--task": task, "--reference": [reference], "--threshold": threshold}
     given = [part for name, values in options.items() for value in values or () if value for part in (name, value)]
-    files = write_report(
-        folder,
-        out,
-        tasks=task or (),
-        reference=reference,
-        thresholds=thresholds,
-        command=shlex.join(["dgpmpc", "report", str(folder), *given]),
-    )
+    command = shlex.join(["dgpmpc", "report", str(folder), *given])
+    try:
+        files = write_report(folder, out, tasks=task or (), reference=reference, thresholds=thresholds, command=command)
+    except (DGPMPCError, ValueError, OSError) as error:
+        typer.echo(f"error: {' '.join(str(error).split())}", err=True)
+        raise typer.Exit(EXIT_ERROR) from error
     typer.echo(f"{files[0]} and {len(files) - 1} figures in {files[0].with_suffix('')}")
 
 

@@ -16,7 +16,7 @@ def run(
     seconds: float = 60.0,
     success: Sequence[bool] | None = None,
     revision: str = "abc",
-    command: str = "dgpmpc bench some",
+    command: str = "dgpmpc bench some --seeds 0",
     versions: dict[str, str] | None = None,
     milliseconds: float | None = 5.0,
 ) -> RunResult:
@@ -32,7 +32,8 @@ def run(
         episodes.append(Episode("planned", value, length, total, seconds, succeeded))
     return RunResult(
         RunKey(method, task, seed), tuple(episodes), {"horizon": 30}, milliseconds,
-        f"2026-01-0{seed + 1}T00:00:00+00:00", command, revision, versions or {"python": "3.11", "numpy": "2.0"}, {"cores": 2},
+        f"2026-01-0{seed + 1}T00:00:00+00:00", command, revision,
+        versions or {"python": "3.11", "numpy": "2.0"}, {"cores": 2},
     )  # fmt: skip
 
 

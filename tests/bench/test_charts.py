@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from PIL import Image
 
 from gym_dgpmpc.bench import charts
@@ -11,20 +10,6 @@ from gym_dgpmpc.bench.styles import COLOURS, styles
 from tests.bench.made_up import grouped, run
 
 OWN = "DGP-MPC L=2 matern32"
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that were saved, to look into."""
-    saved = []
-    original = Figure.savefig
-
-    def savefig(figure, *args, **kwargs):
-        saved.append(figure)
-        original(figure, *args, **kwargs)
-
-    monkeypatch.setattr(Figure, "savefig", savefig)
-    return saved
 
 
 @pytest.fixture
@@ -93,7 +78,8 @@ def test_steps_and_wall_clock(drawn, study, tmp_path):
 def test_one_panel_per_kernel(drawn, tmp_path):
     study = grouped(
         run("DGP-MPC L=1 rbf", [1.0, 2.0]), run("DGP-MPC L=1 rbf", [3.0, 4.0], seed=1),
-        run("DGP-MPC L=3 rbf", [5.0, 6.0]), run("DGP-MPC L=1 matern12", [7.0, 8.0]), run("SAC", [0.0, 0.0]), run("true dynamics", [9.0]),
+        run("DGP-MPC L=3 rbf", [5.0, 6.0]), run("DGP-MPC L=1 matern12", [7.0, 8.0]),
+        run("SAC", [0.0, 0.0]), run("true dynamics", [9.0]),
     )  # fmt: skip
     charts.plot_settings("Pendulum-v1", study["Pendulum-v1"], tmp_path / "a.png")
     rbf, matern = drawn[0].axes

@@ -68,9 +68,9 @@ def test_every_table_and_figure_says_what_it_was_made_from(folder, tmp_path):
     assert len(captions) == len(blocks) > 10
     assert "Not the same in all runs: revisions." in origins
     assert re.search(
-        r"^\| A \| 11 \| `dgpmpc bench some` \| `abc` \| numpy 2.0, python 3.11 \| cores 2 \|", origins, re.M
+        r"^\| A \| 11 \| `dgpmpc bench some …` \(11\) \| `abc` \| numpy 2.0, python 3.11 \| cores 2 \|", origins, re.M
     )
-    assert re.search(r"^\| B \| 2 \| `dgpmpc bench some` \| `def` \|", origins, re.M)
+    assert re.search(r"^\| B \| 2 \| `dgpmpc bench some …` \(2\) \| `def` \|", origins, re.M)
     cart_pole, alone = body.index("## ModCartPole-v0"), body.index("## Alone-v0")
     assert "**Their revisions or versions differ.**" in body[cart_pole:alone]
     assert "**Their" not in body[alone:]
@@ -91,7 +91,16 @@ def test_differing_versions_are_named():
 def test_a_command_cannot_break_the_table():
     study = grouped(run("A", [1.0], command="a | b\nc"))
     (row,) = [line for line in Origins(study).lines() if line.startswith("| A ")]
-    assert "`a \\| b c`" in row
+    assert "`a \\| b c` (1)" in row
+
+
+def test_commands_that_differ_in_their_options_are_told_once():
+    study = grouped(
+        *(run("A", [1.0], seed=seed, command=f"dgpmpc bench table --seeds {seed}") for seed in range(3)),
+        run("B", [1.0], command="python -m benchmarks.other"),
+    )
+    (row,) = [line for line in Origins(study).lines() if line.startswith("| A ")]
+    assert "| 4 | `dgpmpc bench table …` (3), `python -m benchmarks.other` (1) |" in row
 
 
 def test_the_same_files_give_the_same_report(folder, tmp_path):
@@ -157,5 +166,12 @@ def test_command_with_half_a_threshold(command, folder, text):
 
 def test_command_without_results(command, tmp_path):
     result = command(tmp_path, "--out", tmp_path / "out")
-    assert isinstance(result.exception, ResultError)
-    assert "holds no results of runs" in str(result.exception)
+    assert result.exit_code == 2
+    assert result.stderr == f"error: {tmp_path} holds no results of runs (files *_seed*.json)\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_command_with_a_method_that_was_not_run(command, folder, tmp_path):
+    result = command(folder, "--out", tmp_path / "out", "--reference", "PETS")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: no run is of the method 'PETS'; there are DGP-MPC")
