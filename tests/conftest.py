@@ -10,6 +10,7 @@ import jaxtyping
 import pytest
 import torch
 from beartype import BeartypeConf, beartype
+from matplotlib.figure import Figure
 
 typechecked = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float, as in Python's own typing
 
@@ -23,3 +24,17 @@ torch.set_num_threads(1)  # the same sums in the same order on every machine, an
 def unchecked(monkeypatch):
     """Annotations unchecked, as in production, to see the package's own error for an argument of the wrong shape."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that were saved, to look into."""
+    saved = []
+    original = Figure.savefig
+
+    def savefig(figure, *args, **kwargs):
+        saved.append(figure)
+        original(figure, *args, **kwargs)
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    return saved

@@ -3,27 +3,12 @@
 import gymnasium
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from PIL import Image
 
 import gym_dgpmpc  # noqa: F401  # registers the environments
 from gym_dgpmpc.reporting import figures
 from gym_dgpmpc.reporting.figures import Forecast, observation_labels, plot_learning_curve, plot_prediction_fan
 from tests.reporting.toy import ToyPush
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that were saved, to look into."""
-    saved = []
-    original = Figure.savefig
-
-    def savefig(figure, *args, **kwargs):
-        saved.append(figure)
-        original(figure, *args, **kwargs)
-
-    monkeypatch.setattr(Figure, "savefig", savefig)
-    return saved
 
 
 def forecast(horizon=10, particles=200, size=2, seed=0):

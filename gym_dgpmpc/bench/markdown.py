@@ -1,0 +1,45 @@
+"""Tables in Markdown, and numbers and intervals as they are written in them."""
+
+import math
+from collections.abc import Sequence
+
+from gym_dgpmpc.bench.statistics import Estimate
+
+NOTHING = "–"
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table; an empty one has its header alone.
+
+    Raises:
+        ValueError: a row has another number of cells than the header.
+    """
+    for row in rows:
+        if len(row) != len(header):
+            raise ValueError(f"a table of {len(header)} columns got a row of {len(row)} cells: {row}")
+    return [_line(header), "|" + "---|" * len(header), *map(_line, rows)]
+
+
+def cell(text: str) -> str:
+    """A text that cannot end the cell that it stands in."""
+    return " ".join(text.replace("|", "\\|").split())
+
+
+def number(value: float | None) -> str:
+    """About four figures, with a true minus sign."""
+    if value is None or math.isnan(value):
+        return NOTHING
+    size = abs(value)
+    decimals = 0 if size >= 1000 else 1 if size >= 100 else 2
+    return f"{value:,.{decimals}f}".replace("-", "−")
+
+
+def estimate(value: Estimate) -> str:
+    """ "1.20 [1.10, 1.30]", or the number alone where there is no interval."""
+    if value.low is None or value.high is None:
+        return number(value.value)
+    return f"{number(value.value)} [{number(value.low)}, {number(value.high)}]"
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"

@@ -1,0 +1,102 @@
+"""What runs were made with: every table and figure of a report says which seeds, commands, revisions and versions."""
+
+import itertools
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from gym_dgpmpc.bench.markdown import cell, table
+from gym_dgpmpc.bench.results import RunResult
+from gym_dgpmpc.bench.scores import Runs
+
+SECTION = "What the runs were made with"
+
+
+class Origin(NamedTuple):
+    """What runs have in common that the same source made in the same surroundings."""
+
+    revision: str
+    versions: tuple[tuple[str, str], ...]
+    machine: tuple[tuple[str, str], ...]
+
+    @classmethod
+    def of(cls, result: RunResult) -> "Origin":
+        return cls(result.revision, _sorted(result.versions), _sorted(result.machine))
+
+
+class Origins:
+    """Letters for the origins of a set of runs, in the order in which they are met."""
+
+    def __init__(self, study: Mapping[str, Runs]) -> None:
+        self._runs: dict[Origin, list[RunResult]] = {}
+        for runs in study.values():
+            for result in itertools.chain(*runs.values()):
+                self._runs.setdefault(Origin.of(result), []).append(result)
+        self._letters = {origin: _letters(place) for place, origin in enumerate(self._runs)}
+
+    def caption(self, runs: Runs) -> str:
+        """Seeds and origins of the runs behind a table or figure, and whether their revisions or versions differ."""
+        met = {Origin.of(result) for result in itertools.chain(*runs.values())}
+        origins = [origin for origin in self._letters if origin in met]
+        letters = ", ".join(self._letters[origin] for origin in origins)
+        text = f"{_seeds(runs)} Made with [{letters}](#{SECTION.lower().replace(' ', '-')})."
+        return text + (" **Their revisions or versions differ.**" if _differing(origins) else "")
+
+    def lines(self) -> list[str]:
+        """The section that says what each letter stands for."""
+        rows = []
+        for origin, results in self._runs.items():
+            started = sorted(result.started[:10] for result in results)
+            rows.append([
+                self._letters[origin], str(len(results)), _commands(results), f"`{cell(origin.revision)}`",
+                _pairs(origin.versions), _pairs(origin.machine), f"{started[0]} to {started[-1]}",
+            ])  # fmt: skip
+        differing = _differing(list(self._letters))
+        return [
+            f"## {SECTION}",
+            "",
+            f"Not the same in all runs: {differing}." if differing else "All runs have the same revision and versions.",
+            "Each run's own command, with its seed and all its settings, is in its file.",
+            "",
+            *table(["", "runs", "commands", "revision", "versions", "machine", "started"], rows),
+        ]
+
+
+def _commands(results: Sequence[RunResult]) -> str:
+    """The commands without their options, and how many runs each made: "`dgpmpc bench table …` (36)"."""
+    heads = Counter(re.split(r"\s--", result.command)[0] for result in results)
+    options = {re.split(r"\s--", result.command)[0] for result in results if re.search(r"\s--", result.command)}
+    return ", ".join(f"`{cell(head)}{' …' if head in options else ''}` ({count})" for head, count in heads.items())
+
+
+def _seeds(runs: Runs) -> str:
+    """ "Seeds 0, 1, 2." or, where methods have others, "Seeds 0, 1, 2; PETS TS1: 0, 1." """
+    by_method = {method: ", ".join(str(r.key.seed) for r in results) for method, results in runs.items()}
+    texts = list(by_method.values())
+    usual = max(texts, key=texts.count)
+    others = "; ".join(f"{method}: {text}" for method, text in by_method.items() if text != usual)
+    return f"Seeds {usual}" + (f"; {others}" if others else "") + "."
+
+
+def _differing(origins: list[Origin]) -> str:
+    """What is not the same in all of them: "revision, numpy (2.2.6, 2.4.6)"."""
+    found = ["revisions"] if len({origin.revision for origin in origins}) > 1 else []
+    for package in sorted({name for origin in origins for name, _ in origin.versions}):
+        versions = sorted({dict(origin.versions).get(package, "none") for origin in origins})
+        found += [f"{package} ({', '.join(versions)})"] if len(versions) > 1 else []
+    return ", ".join(found)
+
+
+def _sorted(values: Mapping[str, object]) -> tuple[tuple[str, str], ...]:
+    return tuple(sorted((str(name), str(value)) for name, value in values.items()))
+
+
+def _pairs(values: Iterable[tuple[str, str]]) -> str:
+    return cell(", ".join(f"{name} {value}" for name, value in values))
+
+
+def _letters(number: int) -> str:
+    """A to Z, then AA and so on, as spreadsheets name their columns."""
+    head, last = divmod(number, 26)
+    return (_letters(head - 1) if head else "") + chr(ord("A") + last)

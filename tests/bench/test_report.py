@@ -1,0 +1,177 @@
+"""The whole report: all its files, what it says of where they come from, and the command that writes it."""
+
+import re
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from gym_dgpmpc.bench.provenance import Origins
+from gym_dgpmpc.bench.report import write_report
+from gym_dgpmpc.bench.report_command import report
+from gym_dgpmpc.bench.results import ResultError
+from tests.bench.made_up import grouped, run
+
+OWN = "DGP-MPC L=2 matern32"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two tasks with other methods and the ceiling, and one that the package's own method was run on alone."""
+    results = [
+        *(run(OWN, [40.0 + seed, 150.0 + seed], task="ModCartPole-v0", seed=seed, random=-4.0) for seed in range(3)),
+        *(run("SAC", [-4.0] * 2 + [90.0 + s] * 20, task="ModCartPole-v0", seed=s, revision="def") for s in range(2)),
+        run("DGP-MPC L=3 rbf", [44.0, 155.0], task="ModCartPole-v0", random=-4.0),
+        run("true dynamics", [176.0, 176.0], task="ModCartPole-v0"),
+        *(run(m, [v] * 3, task="Fetch-v4", seed=s, random=-9.0, success=[False, False, True])
+          for s in range(2) for m, v in ((OWN, -2.0 + s), ("SAC", -8.0 - s))),
+        run("true dynamics", [-1.0], task="Fetch-v4"),
+        run(OWN, [3.0], task="Alone-v0"),
+    ]  # fmt: skip
+    for result in results:
+        result.write(tmp_path / "runs")
+    return tmp_path / "runs"
+
+
+def test_every_figure_and_table(folder, tmp_path):
+    files = write_report(folder, tmp_path / "docs" / "results", command="dgpmpc report runs")
+    page = files[0].read_text()
+    assert files[0] == tmp_path / "docs" / "results.md"
+    assert all(file.stat().st_size > 0 for file in files)
+    shown = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", page)
+    assert [files[0].parent / name for name in shown] == files[1:]  # every link has a file, every file a link
+    assert shown == [
+        "results/comparison.png", "results/maximum.png", "results/variability.png",
+        "results/ModCartPole-v0_learning.png", "results/ModCartPole-v0_settings.png", "results/Alone-v0_learning.png",
+        "results/Fetch-v4_learning.png",
+    ]  # fmt: skip
+    headings = re.findall(r"^#+ (.*)$", page, re.MULTILINE)
+    assert headings == [
+        "Results", "All methods", "The paper's table", "ModCartPole-v0", "Alone-v0", "Fetch-v4",
+        "What the runs were made with",
+    ]  # fmt: skip
+    assert "Made from 13 result files" in page
+    assert "by `dgpmpc report runs`" in page
+    for text in (
+        f"P({OWN} > Y)", "| Y | P(DGP-MPC > Y) | tasks |", "median (Kaplan–Meier)", "last 5 episodes", "140.81 ± 4.35",
+        "0 is what random actions earn", "within 300 environment steps", "reached 149.8",
+        "Share of successful episodes",
+    ):  # fmt: skip
+        assert text in page
+
+
+def test_every_table_and_figure_says_what_it_was_made_from(folder, tmp_path):
+    page = write_report(folder, tmp_path / "out")[0].read_text()
+    body, origins = page.split("## What the runs were made with")
+    blocks = re.findall(r"^\|---.*$|^!\[.*$", body, re.MULTILINE)
+    captions = re.findall(r"Seeds .* Made with \[[A-Z, ]+\]\(#what-the-runs-were-made-with\)\.", body)
+    assert len(captions) == len(blocks) > 10
+    assert "Not the same in all runs: revisions." in origins
+    assert re.search(
+        r"^\| A \| 11 \| `dgpmpc bench some …` \(11\) \| `abc` \| numpy 2.0, python 3.11 \| cores 2 \|", origins, re.M
+    )
+    assert re.search(r"^\| B \| 2 \| `dgpmpc bench some …` \(2\) \| `def` \|", origins, re.M)
+    cart_pole, alone = body.index("## ModCartPole-v0"), body.index("## Alone-v0")
+    assert "**Their revisions or versions differ.**" in body[cart_pole:alone]
+    assert "**Their" not in body[alone:]
+    assert "Seeds 0, 1; true dynamics: 0." in body[alone:]
+
+
+def test_differing_versions_are_named():
+    study = grouped(
+        run("A", [1.0], versions={"numpy": "2.0", "torch": "2.3"}), run("B", [1.0], versions={"numpy": "2.1"}),
+    )  # fmt: skip
+    origins = Origins(study)
+    assert "Not the same in all runs: numpy (2.0, 2.1), torch (2.3, none)." in origins.lines()
+    assert origins.caption(study["Pendulum-v1"]).endswith("**Their revisions or versions differ.**")
+    alike = Origins(grouped(run("A", [1.0]), run("B", [1.0])))
+    assert "All runs have the same revision and versions." in alike.lines()
+
+
+def test_a_command_cannot_break_the_table():
+    study = grouped(run("A", [1.0], command="a | b\nc"))
+    (row,) = [line for line in Origins(study).lines() if line.startswith("| A ")]
+    assert "`a \\| b c` (1)" in row
+
+
+def test_commands_that_differ_in_their_options_are_told_once():
+    study = grouped(
+        *(run("A", [1.0], seed=seed, command=f"dgpmpc bench table --seeds {seed}") for seed in range(3)),
+        run("B", [1.0], command="python -m benchmarks.other"),
+    )
+    (row,) = [line for line in Origins(study).lines() if line.startswith("| A ")]
+    assert "| 4 | `dgpmpc bench table …` (3), `python -m benchmarks.other` (1) |" in row
+
+
+def test_the_same_files_give_the_same_report(folder, tmp_path):
+    first = write_report(folder, tmp_path / "one" / "out")
+    second = write_report(folder, tmp_path / "two" / "out.md", tasks=["ModCartPole-v0", "Alone-v0", "Fetch-v4"])
+    assert [file.name for file in first] == [file.name for file in second]
+    assert all(a.read_bytes() == b.read_bytes() for a, b in zip(first, second, strict=True))
+
+
+def test_tasks_and_references_can_be_chosen(folder, tmp_path):
+    files = write_report(folder, tmp_path / "out", tasks=["ModCartPole-v0"], reference="DGP-MPC L=3 rbf")
+    page = files[0].read_text()
+    assert "P(DGP-MPC L=3 rbf > Y)" in page
+    assert "Fetch-v4" not in page
+    with pytest.raises(
+        ResultError, match="has no runs of Ant-v5; there are runs of ModCartPole-v0, Alone-v0, Fetch-v4"
+    ):
+        write_report(folder, tmp_path / "out", tasks=["Ant-v5"])
+    with pytest.raises(ValueError, match="no run is of the method 'PETS'"):
+        write_report(folder, tmp_path / "out", reference="PETS")
+    with pytest.raises(ValueError, match="a threshold is given for Ant-v5"):
+        write_report(folder, tmp_path / "out", thresholds={"Ant-v5": 1.0})
+
+
+def test_the_ceiling_alone_makes_a_report(tmp_path):
+    run("true dynamics", [5.0]).write(tmp_path / "runs")
+    files = write_report(tmp_path / "runs", tmp_path / "out")
+    assert len(files) == 1
+    assert "*true dynamics* (all its episodes)" in files[0].read_text()
+
+
+def test_a_damaged_folder_writes_nothing(folder, tmp_path):
+    damaged = folder / "Fetch-v4_SAC_seed0.json"
+    damaged.write_text(damaged.read_text()[:-40])
+    with pytest.raises(ResultError, match=r"Fetch-v4_SAC_seed0\.json is not a result of a run"):
+        write_report(folder, tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+@pytest.fixture
+def command():
+    app = typer.Typer()
+    app.command()(report)
+    return lambda *arguments: CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_command(command, folder, tmp_path):
+    out = tmp_path / "out"
+    result = command(folder, "--out", out, "--task", "Fetch-v4", "--threshold", "Fetch-v4=-2.5")
+    assert result.exit_code == 0, result.output
+    assert result.output.split() == [str(out.with_suffix(".md")), "and", "4", "figures", "in", str(out)]
+    page = out.with_suffix(".md").read_text()
+    assert f"by `dgpmpc report {folder} --out {out} --task Fetch-v4 --threshold Fetch-v4=-2.5`" in page
+    assert "first reached −2.50 (as given)" in page
+
+
+@pytest.mark.parametrize("text", ["Fetch-v4", "=1", "Fetch-v4=much", "Fetch-v4=nan"])
+def test_command_with_half_a_threshold(command, folder, text):
+    result = command(folder, "--threshold", text)
+    assert result.exit_code == 2
+    assert "expected TASK=RETURN" in result.output
+
+
+def test_command_without_results(command, tmp_path):
+    result = command(tmp_path, "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert result.stderr == f"error: {tmp_path} holds no results of runs (files *_seed*.json)\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_command_with_a_method_that_was_not_run(command, folder, tmp_path):
+    result = command(folder, "--out", tmp_path / "out", "--reference", "PETS")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: no run is of the method 'PETS'; there are DGP-MPC")
