@@ -14,6 +14,7 @@ import os
 import platform
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -51,6 +52,7 @@ from gym_dgpmpc.envs.mod_cartpole import ModCartPoleEnv
 from gym_dgpmpc.errors import DGPMPCError
 from gym_dgpmpc.gp.kernels import KERNELS, check_kernel
 from gym_dgpmpc.inference.mcem import InferenceSettings
+from gym_dgpmpc.types import DynamicsModel
 
 LAYERS, SEEDS = (1, 2, 3), tuple(range(10))
 
@@ -183,7 +185,7 @@ def contact_runs(
 
 
 def open_loop(
-    model: DeepGPDynamics, test: ContactTest, num_particles: int, generator: torch.Generator
+    model: DynamicsModel, test: ContactTest, num_particles: int, generator: torch.Generator
 ) -> Float[ndarray, "H_plus_1 P K S"]:
     """States of P particles from each of the test's starts, each step predicted from the particle's last state."""
     horizon, starts = len(test.states) - 1, torch.from_numpy(test.states[0])
@@ -226,7 +228,7 @@ def _perform_all(runs: Sequence[ContactRun], folder: Path, jobs: int) -> Iterato
         return
     # Forking a process that has used PyTorch may leave its locks taken.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker) as pool:
         futures = [pool.submit(_perform, run, folder) for run in runs]
         try:
             for future in as_completed(futures):
@@ -234,6 +236,19 @@ def _perform_all(runs: Sequence[ContactRun], folder: Path, jobs: int) -> Iterato
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _begin_worker() -> None:
+    """One thread, and an end when the study's own process has been killed: nobody would take the results."""
+    torch.set_num_threads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _perform(run: ContactRun, folder: Path) -> str:
@@ -289,15 +304,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     report.add_argument("folder", type=Path)
     report.add_argument("out", type=Path)
     given = parser.parse_args(arguments)
-    if given.command == "report":
-        for path in report_contact_study(given.folder, given.out):
-            print(path)
-        return
     torch.set_num_threads(1)
     try:
-        run_contact_study(given.folder, given.cases, given.kernels, given.layers, given.seeds, given.jobs)
-    except DGPMPCError as error:
+        if given.command == "report":
+            written = report_contact_study(given.folder, given.out)
+        else:
+            written = run_contact_study(given.folder, given.cases, given.kernels, given.layers, given.seeds, given.jobs)
+    except (DGPMPCError, ValueError) as error:
         sys.exit(str(error))
+    print(f"{written[0]} and {len(written) - 1} other files")
 
 
 if __name__ == "__main__":

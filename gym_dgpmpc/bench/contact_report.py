@@ -106,7 +106,7 @@ def estimate(values: Float[ndarray, " n"]) -> Estimate:
 
 def _interval(values: Float[ndarray, "n *b"]) -> tuple[ndarray, ndarray]:
     """Ends of the interval of the mean over the first axis."""
-    low, high = stats.bootstrap(
+    interval = stats.bootstrap(
         (values,),
         lambda sample, axis: sample.mean(axis),
         axis=0,
@@ -117,7 +117,7 @@ def _interval(values: Float[ndarray, "n *b"]) -> tuple[ndarray, ndarray]:
         method="percentile",
         rng=np.random.default_rng(0),
     ).confidence_interval
-    return low, high
+    return np.asarray(interval.low), np.asarray(interval.high)
 
 
 def _study(results: Sequence[ContactResult], case: str) -> Study:
