@@ -262,7 +262,6 @@ def _perform(run: ContactRun, folder: Path) -> str:
 def _facts() -> dict[str, Any]:
     """What a run was made with."""
     return {
-        "command": f"python -m gym_dgpmpc.bench.contact {' '.join(sys.argv[1:])}".strip(),
         "revision": _revision(),
         "versions": {"python": platform.python_version()}
         | {name: importlib.metadata.version(name) for name in PACKAGES},

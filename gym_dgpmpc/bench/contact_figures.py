@@ -113,6 +113,8 @@ def _label_grid(grid: ndarray, kernels: Sequence[str], layers: Sequence[int], yl
         grid[row, 0].set_ylabel(f"{KERNEL_NAMES[kernel]}\n{ylabel}", fontsize="small")
     for axes in grid.flat:
         axes.grid(alpha=0.3)
+        if not axes.lines:
+            axes.text(0.5, 0.5, "no run", transform=axes.transAxes, ha="center", va="center", color="gray")
 
 
 def _legend_below(figure: Figure, axes: Axes) -> None:

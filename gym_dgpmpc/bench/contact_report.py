@@ -6,7 +6,7 @@ were trained on the same sequences and tested on the same trajectories.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +20,9 @@ from gym_dgpmpc.bench.contact_results import QUANTITIES, UNITS, ContactResult, r
 from gym_dgpmpc.bench.contact_scores import LEVELS, SCORES, coverage_name
 
 REPORT = "contact_study.md"
+
+COMMAND = "python -m gym_dgpmpc.bench.contact run RUNS"
+"""What makes all runs of the study."""
 
 QUANTITY = "angular velocity"
 """Whose scores are told in full."""
@@ -193,48 +196,47 @@ def _scores_table(study: Study, phase: str | None) -> list[str]:
 
 def _depth_table(study: Study, phase: str | None) -> list[str]:
     """Each deeper model less the one of one layer, for each kernel and for all of them together."""
-    deeper = sorted({num_layers for _, num_layers in study} - {SHALLOWEST})
     kernels = list(dict.fromkeys(kernel for kernel, _ in study))
     rows = []
-    for num_layers in deeper:
-        for group in [*([kernel] for kernel in kernels), kernels]:
+    for num_layers in sorted({num_layers for _, num_layers in study} - {SHALLOWEST}):
+        for group in _each_and_all(kernels):
             pairs = [((kernel, num_layers), (kernel, SHALLOWEST)) for kernel in group]
             name = KERNEL_NAMES[group[0]] if len(group) == 1 else "all kernels"
-            rows.append([f"L = {num_layers} less L = {SHALLOWEST}", name, *_difference_cells(study, pairs, phase)])
-        if len(kernels) == 1:
-            rows.pop()
+            rows += _difference_rows(study, pairs, phase, f"L = {num_layers} less L = {SHALLOWEST}", name)
     return _table(["difference", "kernel", "seeds", *_DIFFERENCE_HEADER], rows)
 
 
 def _kernel_table(study: Study, phase: str | None) -> list[str]:
     """Each rougher kernel less the RBF, for each depth and for all of them together."""
-    rougher = list(dict.fromkeys(kernel for kernel, _ in study if kernel != SMOOTHEST))
     depths = sorted({num_layers for _, num_layers in study})
     rows = []
-    for kernel in rougher:
-        for group in [*([num_layers] for num_layers in depths), depths]:
+    for kernel in dict.fromkeys(kernel for kernel, _ in study if kernel != SMOOTHEST):
+        for group in _each_and_all(depths):
             pairs = [((kernel, num_layers), (SMOOTHEST, num_layers)) for num_layers in group]
             name = str(group[0]) if len(group) == 1 else "all"
-            rows.append(
-                [
-                    f"{KERNEL_NAMES[kernel]} less {KERNEL_NAMES[SMOOTHEST]}",
-                    name,
-                    *_difference_cells(study, pairs, phase),
-                ]
+            rows += _difference_rows(
+                study, pairs, phase, f"{KERNEL_NAMES[kernel]} less {KERNEL_NAMES[SMOOTHEST]}", name
             )
-        if len(depths) == 1:
-            rows.pop()
     return _table(["difference", "L", "seeds", *_DIFFERENCE_HEADER], rows)
+
+
+def _each_and_all(values: list[Any]) -> list[list[Any]]:
+    """Groups of one, and the group of all if that is another."""
+    return [[value] for value in values] + ([values] if len(values) > 1 else [])
 
 
 _DIFFERENCE_HEADER = [column for name in PROPER.values() for column in (name, "")]
 
 
-def _difference_cells(study: Study, pairs: Sequence[tuple[Setting, Setting]], phase: str | None) -> list[str]:
-    """The number of seeds, and for each score the difference and what it says."""
+def _difference_rows(
+    study: Study, pairs: Sequence[tuple[Setting, Setting]], phase: str | None, *names: str
+) -> list[list[str]]:
+    """A row with the number of seeds and, for each score, the difference and what it says; none without a seed."""
     values = [paired_differences(study, pairs, score, phase) for score in PROPER]
+    if not len(values[0]):
+        return []
     found = [estimate(differences) for differences in values]
-    return [str(len(values[0])), *(text for one in found for text in (str(one), verdict(one)))]
+    return [[*names, str(len(values[0])), *(text for one in found for text in (str(one), verdict(one)))]]
 
 
 def verdict(difference: Estimate) -> str:
@@ -277,7 +279,7 @@ def _provenance(results: Sequence[ContactResult]) -> list[str]:
         f"- {len(results)} runs, seeds {seeds}; the fans show the first of them",
         f"- settings: {', '.join(f'{name} {value}' for name, value in vars(results[0].settings).items())}",
         f"- median CPU time of a training: {times}",
-        f"- commands: {different([str(fact['command']) for fact in facts])}",
+        f"- command: `{COMMAND}`",
         f"- revisions: {different([str(fact['revision']) for fact in facts])}",
         f"- versions: {different([_pairs(fact['versions']) for fact in facts])}",
         f"- machines: {different([_pairs(fact['machine']) for fact in facts])}",

@@ -60,8 +60,8 @@ class ContactSettings:
         num_paths: trajectories from the mean start that are kept for the figure.
     """
 
-    num_inducing: int = 100
-    first_iterations: int = 2000
+    num_inducing: int = 200
+    first_iterations: int = 1000
     patience: int | None = None
     num_samples: int = 50
     sample_spacing: int = 10
@@ -86,7 +86,7 @@ class ContactResult:
         training: what `DeepGPDynamics.fit` reported.
         fit_seconds: CPU time of training.
         test_seconds: CPU time of the test.
-        facts: command, revision, versions, machine and when the run started.
+        facts: revision, versions, machine and when the run started.
     """
 
     key: ContactKey

@@ -48,5 +48,5 @@ def made_up(key: ContactKey, value: float, after: float | None = None, starts_af
         training={"iterations": 30.0},
         fit_seconds=1.5,
         test_seconds=0.5,
-        facts={"command": "made | up", "revision": "unknown", "versions": {"python": "3"}, "machine": {"cores": 2}},
+        facts={"revision": "unknown", "versions": {"python": "3"}, "machine": {"cores": 2}},
     )
