@@ -1,0 +1,298 @@
+"""Tables and figures of the contact study, and what depth and rougher kernels change, from the files of its runs.
+
+All intervals are 95 % percentile bootstrap intervals over seeds. Settings are compared seed by seed: the runs of a seed
+were trained on the same sequences and tested on the same trajectories.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy import stats
+
+from gym_dgpmpc.agents.files import replace_text
+from gym_dgpmpc.bench.contact_data import CASES
+from gym_dgpmpc.bench.contact_figures import KERNEL_NAMES, Curve, Setting, plot_fans, plot_scores_by_step
+from gym_dgpmpc.bench.contact_results import QUANTITIES, UNITS, ContactResult, read_contact_results
+from gym_dgpmpc.bench.contact_scores import LEVELS, SCORES, coverage_name
+
+REPORT = "contact_study.md"
+
+COMMAND = "python -m gym_dgpmpc.bench.contact run RUNS"
+"""What makes all runs of the study."""
+
+QUANTITY = "angular velocity"
+"""Whose scores are told in full."""
+
+SMOOTHEST, SHALLOWEST = "rbf", 1
+"""What rougher kernels and deeper models are compared with."""
+
+PROPER = {"nlpd": "NLPD", "crps": "CRPS"}
+
+CONFIDENCE, RESAMPLES = 0.95, 10_000
+
+BySeed = Mapping[int, ContactResult]
+Study = Mapping[Setting, BySeed]
+"""The runs of one case."""
+
+
+class Estimate(NamedTuple):
+    """A mean over seeds and its interval; no interval from a single seed."""
+
+    value: float
+    low: float | None = None
+    high: float | None = None
+
+    def __str__(self) -> str:
+        if self.low is None or self.high is None:
+            return f"{self.value:.3f}".replace("-", "−")
+        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]".replace("-", "−")
+
+
+def report_contact_study(folder: Path, out: Path) -> list[Path]:
+    """Write the report `contact_study.md` and its figures into ``out``, and return all files.
+
+    Args:
+        folder: where `run_contact_study` left its files; not all of its runs need be there.
+        out: made if there is none.
+
+    Raises:
+        ResultError: a file is damaged, there is none, or they are not of one study.
+    """
+    results = read_contact_results(folder)
+    out.mkdir(parents=True, exist_ok=True)
+    lines, written = _head(results), []
+    for case in sorted({result.key.case for result in results}):
+        study = _study(results, case)
+        fans, steps = out / f"fans_{case}.png", out / f"steps_{case}.png"
+        seed = min(seed for by_seed in study.values() for seed in by_seed)
+        plot_fans({setting: by_seed[seed] for setting, by_seed in study.items() if seed in by_seed}, fans)
+        curves = {score: {setting: _curve(by_seed, score) for setting, by_seed in study.items()} for score in SCORES}
+        title = f"Case {case}: {CASES[case].title}; {QUANTITY} predicted open-loop"
+        plot_scores_by_step(curves, QUANTITY, title, steps)
+        written += [fans, steps]
+        lines += _section(case, study, fans.name, steps.name)
+    replace_text(out / REPORT, "\n".join([*lines, *_provenance(results)]) + "\n")
+    return [out / REPORT, *written]
+
+
+def paired_differences(
+    study: Study, pairs: Sequence[tuple[Setting, Setting]], score: str, phase: str | None = None
+) -> Float[ndarray, " n"]:
+    """For each seed that has all runs of ``pairs``, the mean over them of the first's score less the second's.
+
+    Args:
+        study: the runs of one case.
+        pairs: settings to compare.
+        score: of `QUANTITY`, one of `SCORES`.
+        phase: the steps that count, one of `PHASES`, or None for all. A seed whose test has none is left out.
+    """
+
+    def of(setting: Setting, seed: int) -> float:
+        return study[setting][seed].mean(QUANTITY, score, phase)
+
+    seeds = set.intersection(*(set(study.get(setting, ())) for pair in pairs for setting in pair))
+    differences = [np.mean([of(new, seed) - of(old, seed) for new, old in pairs]) for seed in sorted(seeds)]
+    return np.array([d for d in differences if np.isfinite(d)], dtype=np.float64)
+
+
+def estimate(values: Float[ndarray, " n"]) -> Estimate:
+    """The mean of one number per seed, with its bootstrap interval; NaN of none."""
+    if len(values) < 2:
+        return Estimate(float(values[0]) if len(values) else float("nan"))
+    low, high = _interval(values)
+    return Estimate(float(values.mean()), float(low), float(high))
+
+
+def _interval(values: Float[ndarray, "n *b"]) -> tuple[ndarray, ndarray]:
+    """Ends of the interval of the mean over the first axis."""
+    interval = stats.bootstrap(
+        (values,),
+        lambda sample, axis: sample.mean(axis),
+        axis=0,
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        batch=1000,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return np.asarray(interval.low), np.asarray(interval.high)
+
+
+def _study(results: Sequence[ContactResult], case: str) -> Study:
+    """Settings from smooth to rough kernels, then by depth."""
+    study: dict[Setting, dict[int, ContactResult]] = {}
+    rank = list(KERNEL_NAMES).index
+    chosen = [result for result in results if result.key.case == case]
+    for result in sorted(chosen, key=lambda r: (rank(r.key.kernel), r.key.num_layers, r.key.seed)):
+        study.setdefault((result.key.kernel, result.key.num_layers), {})[result.key.seed] = result
+    return study
+
+
+def _curve(by_seed: BySeed, score: str) -> Curve:
+    values = np.stack([result.by_step(QUANTITY, score) for result in by_seed.values()])
+    mean = values.mean(axis=0)
+    low, high = _interval(values) if len(values) > 1 else (mean, mean)
+    return mean, low, high
+
+
+def _over_seeds(by_seed: BySeed, quantity: str, score: str, phase: str | None = None) -> Estimate:
+    values = np.array([result.mean(quantity, score, phase) for result in by_seed.values()])
+    return estimate(values[np.isfinite(values)])
+
+
+def _head(results: Sequence[ContactResult]) -> list[str]:
+    settings = results[0].settings
+    return [
+        "# Contact study: results",
+        "",
+        f"Mean over seeds [95 % bootstrap interval over seeds] of the scores of {settings.num_particles} open-loop "
+        f"trajectories from each of {settings.num_starts} starts: negative log predictive density (NLPD), continuous "
+        "ranked probability score (CRPS), and the share of true values inside the central 50, 90 and 95 % intervals.",
+        "NLPD and CRPS: lower is better. What the cases, scores and figures are is told in the documentation, "
+        "`docs/contact_study.md`.",
+        "",
+    ]
+
+
+def _section(case: str, study: Study, fans: str, steps: str) -> list[str]:
+    any_run = next(iter(next(iter(study.values())).values()))
+    seen = [run for by_seed in study.values() for run in by_seed.values()]
+    in_training, in_test = (
+        float(np.mean([getattr(run, name) for run in seen])) for name in ("training_contact", "test_contact")
+    )
+    has_contact = any(sum(run.counts["after"]) for run in seen)
+    phases = [(None, "all steps")] + ([("after", "steps from the contact on")] if has_contact else [])
+    lines = [
+        f"## Case {case}: {CASES[case].title}",
+        "",
+        f"The cart goes beyond the end of the rail in {in_training:.0%} of the training sequences and {in_test:.0%} of "
+        f"the {len(any_run.truth)}-step tests.",
+        "",
+        f"![Trajectories]({fans})",
+        "",
+        f"![Scores by step]({steps})",
+        "",
+    ]
+    for phase, text in phases:
+        lines += [f"### Scores of the {QUANTITY}, {text}", "", *_scores_table(study, phase), ""]
+        lines += [f"### What depth changes, {text}", "", *_depth_table(study, phase), ""]
+        lines += [f"### What the kernel changes, {text}", "", *_kernel_table(study, phase), ""]
+    return [*lines, "### The other quantities, all steps", "", *_quantities_table(study), ""]
+
+
+def _scores_table(study: Study, phase: str | None) -> list[str]:
+    names = [*PROPER.values(), *(f"inside {level:.0%}" for level in LEVELS)]
+    rows = []
+    for (kernel, num_layers), by_seed in study.items():
+        means = [str(_over_seeds(by_seed, QUANTITY, score, phase)) for score in SCORES]
+        rows.append([KERNEL_NAMES[kernel], str(num_layers), str(len(by_seed)), *means])
+    return _table(["kernel", "L", "seeds", *names], rows)
+
+
+def _depth_table(study: Study, phase: str | None) -> list[str]:
+    """Each deeper model less the one of one layer, for each kernel and for all of them together."""
+    kernels = list(dict.fromkeys(kernel for kernel, _ in study))
+    rows = []
+    for num_layers in sorted({num_layers for _, num_layers in study} - {SHALLOWEST}):
+        for group in _each_and_all(kernels):
+            pairs = [((kernel, num_layers), (kernel, SHALLOWEST)) for kernel in group]
+            name = KERNEL_NAMES[group[0]] if len(group) == 1 else "all kernels"
+            rows += _difference_rows(study, pairs, phase, f"L = {num_layers} less L = {SHALLOWEST}", name)
+    return _table(["difference", "kernel", "seeds", *_DIFFERENCE_HEADER], rows)
+
+
+def _kernel_table(study: Study, phase: str | None) -> list[str]:
+    """Each rougher kernel less the RBF, for each depth and for all of them together."""
+    depths = sorted({num_layers for _, num_layers in study})
+    rows = []
+    for kernel in dict.fromkeys(kernel for kernel, _ in study if kernel != SMOOTHEST):
+        for group in _each_and_all(depths):
+            pairs = [((kernel, num_layers), (SMOOTHEST, num_layers)) for num_layers in group]
+            name = str(group[0]) if len(group) == 1 else "all"
+            rows += _difference_rows(
+                study, pairs, phase, f"{KERNEL_NAMES[kernel]} less {KERNEL_NAMES[SMOOTHEST]}", name
+            )
+    return _table(["difference", "L", "seeds", *_DIFFERENCE_HEADER], rows)
+
+
+def _each_and_all(values: list[Any]) -> list[list[Any]]:
+    """Groups of one, and the group of all if that is another."""
+    return [[value] for value in values] + ([values] if len(values) > 1 else [])
+
+
+_DIFFERENCE_HEADER = [column for name in PROPER.values() for column in (name, "")]
+
+
+def _difference_rows(
+    study: Study, pairs: Sequence[tuple[Setting, Setting]], phase: str | None, *names: str
+) -> list[list[str]]:
+    """A row with the number of seeds and, for each score, the difference and what it says; none without a seed."""
+    values = [paired_differences(study, pairs, score, phase) for score in PROPER]
+    if not len(values[0]):
+        return []
+    found = [estimate(differences) for differences in values]
+    return [[*names, str(len(values[0])), *(text for one in found for text in (str(one), verdict(one)))]]
+
+
+def verdict(difference: Estimate) -> str:
+    """What a difference of a score, of which less is better, says: its interval has to leave out zero."""
+    if difference.low is None or difference.high is None:
+        return "too few seeds"
+    return "better" if difference.high < 0 else "worse" if difference.low > 0 else "undecided"
+
+
+def _quantities_table(study: Study) -> list[str]:
+    others = [quantity for quantity in QUANTITIES if quantity != QUANTITY]
+    header = ["kernel", "L"]
+    for quantity in others:
+        unit = UNITS[QUANTITIES.index(quantity)]
+        header += [f"{quantity}: NLPD", f"CRPS ({unit})", "inside 90%"]
+    rows = []
+    for (kernel, num_layers), by_seed in study.items():
+        cells = [
+            f"{_over_seeds(by_seed, quantity, score).value:.3f}".replace("-", "−")
+            for quantity in others
+            for score in (*PROPER, coverage_name(0.9))
+        ]
+        rows.append([KERNEL_NAMES[kernel], str(num_layers), *cells])
+    return _table(header, rows)
+
+
+def _provenance(results: Sequence[ContactResult]) -> list[str]:
+    """Settings, commands, revisions and versions, each different one once."""
+
+    def different(values: Sequence[str]) -> str:
+        return "; ".join(f"`{value}`" for value in dict.fromkeys(values))
+
+    facts = [result.facts for result in results]
+    fits = {depth: [r.fit_seconds for r in results if r.key.num_layers == depth] for depth in _depths(results)}
+    times = ", ".join(f"{np.median(seconds):.0f} s at L = {depth}" for depth, seconds in fits.items())
+    seeds = ", ".join(map(str, sorted({result.key.seed for result in results})))
+    return [
+        "## What the runs were made with",
+        "",
+        f"- {len(results)} runs, seeds {seeds}; the fans show the first of them",
+        f"- settings: {', '.join(f'{name} {value}' for name, value in vars(results[0].settings).items())}",
+        f"- median CPU time of a training: {times}",
+        f"- command: `{COMMAND}`",
+        f"- revisions: {different([str(fact['revision']) for fact in facts])}",
+        f"- versions: {different([_pairs(fact['versions']) for fact in facts])}",
+        f"- machines: {different([_pairs(fact['machine']) for fact in facts])}",
+    ]
+
+
+def _depths(results: Sequence[ContactResult]) -> list[int]:
+    return sorted({result.key.num_layers for result in results})
+
+
+def _pairs(values: Mapping[str, object]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in values.items())
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(row)} |" for row in (header, ["---"] * len(header), *rows)]
