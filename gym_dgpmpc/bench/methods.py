@@ -166,8 +166,7 @@ def random_steps(task: Task) -> int:
 
 def _planning(task: Task) -> Mapping[str, Any]:
     """The paper's settings on its tasks, this package's own on Gymnasium's, else none."""
-    stock: Mapping[str, Mapping[str, Any]] = getattr(presets, "STOCK", {})
-    return {**presets.PAPER, **stock}.get(task.preset, {})
+    return presets.settings_for(task.preset)
 
 
 def _planning_alone(task: Task) -> Mapping[str, Any]:
