@@ -12,6 +12,7 @@ from gym_dgpmpc.agents.checkpoint import read_checkpoint
 
 CLOCK = {"record.0.seconds", "record.0.plan_seconds"}
 """Tensors of a checkpoint that tell the time."""
+CLOCK_COLUMNS = {"seconds", "planning_seconds"}
 CLOCK_TAGS = ("time/", "train/seconds")
 
 
@@ -90,4 +91,4 @@ def _same(one, other):
 
 def _rows(folder):
     with (folder / "episodes.csv").open(newline="") as file:
-        return [{name: value for name, value in row.items() if name != "seconds"} for row in csv.DictReader(file)]
+        return [{name: row[name] for name in row.keys() - CLOCK_COLUMNS} for row in csv.DictReader(file)]
