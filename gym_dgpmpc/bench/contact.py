@@ -8,21 +8,13 @@ fan of trajectories to one file; `contact_report.py` makes tables and figures of
 """
 
 import argparse
-import importlib.metadata
-import multiprocessing
-import os
-import platform
-import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -40,6 +32,7 @@ from gym_dgpmpc.bench.contact_data import (
 )
 from gym_dgpmpc.bench.contact_report import report_contact_study
 from gym_dgpmpc.bench.contact_results import (
+    QUANTITY,
     ContactKey,
     ContactResult,
     ContactSettings,
@@ -47,16 +40,17 @@ from gym_dgpmpc.bench.contact_results import (
     refuse_other_settings,
 )
 from gym_dgpmpc.bench.contact_scores import scores
+from gym_dgpmpc.bench.executors import executor
+from gym_dgpmpc.bench.jobs import Folders, keep
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
 from gym_dgpmpc.envs.mod_cartpole import ModCartPoleEnv
 from gym_dgpmpc.errors import DGPMPCError
 from gym_dgpmpc.gp.kernels import KERNELS, check_kernel
 from gym_dgpmpc.inference.mcem import InferenceSettings
+from gym_dgpmpc.reporting.circumstances import machine, revision, versions
 from gym_dgpmpc.types import DynamicsModel
 
 LAYERS, SEEDS = (1, 2, 3), tuple(range(10))
-
-PACKAGES = ("gym-dgpmpc", "mujoco", "numpy", "torch")
 
 _ANGULAR_VELOCITY = 3
 
@@ -67,7 +61,7 @@ class ContactStudyError(DGPMPCError, RuntimeError):
 
 @dataclass(frozen=True)
 class ContactRun:
-    """One piece of the study's work, which leaves one file; it depends on its key and the settings alone."""
+    """A `Job`: one piece of the study's work, which depends on its key and the settings alone."""
 
     key: ContactKey
     settings: ContactSettings
@@ -94,6 +88,17 @@ class ContactRun:
             return False
         refuse_other_settings(ContactResult.read(path), self.settings, results)
         return True
+
+    def perform(self, folders: Folders) -> str:
+        """Measure and write.
+
+        Raises:
+            TrainingError: training diverged however small its steps.
+            OSError: the result cannot be written.
+        """
+        result = self.measure()
+        result.write(folders.results)
+        return f"CRPS {result.mean(QUANTITY, 'crps'):.3f} rad/s, {result.fit_seconds:.0f} s of training"
 
     def measure(self) -> ContactResult:
         """Train, roll out, score.
@@ -125,7 +130,7 @@ class ContactRun:
             training=dict(training),
             fit_seconds=fitted - since,
             test_seconds=time.process_time() - fitted,
-            facts={"started": started, **_facts()},
+            facts={"started": started, "revision": revision(), "versions": versions(), "machine": machine()},
         )
 
 
@@ -143,7 +148,7 @@ def run_contact_study(
     It does not matter how often a study was interrupted, nor on how many processes it ran.
 
     Args:
-        folder: one file for each run; made if there is none.
+        folder: one file for each run, and the log of each that failed; made if there is none.
         cases: names of `CASES`.
         kernels: names of `KERNELS`.
         layers: numbers of layers.
@@ -160,7 +165,11 @@ def run_contact_study(
         raise ValueError(f"jobs must be at least 1, received {jobs}")
     runs = contact_runs(cases, kernels, layers, seeds, settings or ContactSettings())
     missing = [run for run in runs if not run.is_finished(folder)]
-    failures = [failure for failure in _perform_all(missing, folder, jobs) if failure]
+    folders, failures = Folders(folder.resolve(), folder.resolve()), []
+    for run, outcome in executor(jobs)(missing, folders):
+        keep(run, outcome, folders.results)
+        if outcome.content is None:
+            failures.append(f"{run.name}: {outcome.told}")
     if failures:
         raise ContactStudyError(f"{len(failures)} of {len(missing)} runs failed: {'; '.join(failures)}")
     return [folder / run.file_name for run in runs]
@@ -219,73 +228,6 @@ def _model(key: ContactKey, settings: ContactSettings) -> DeepGPDynamics:
         inference=InferenceSettings(patience=settings.patience),
         dtype=torch.float64,
     )
-
-
-def _perform_all(runs: Sequence[ContactRun], folder: Path, jobs: int) -> Iterator[str]:
-    """Do the runs; for each an empty text, or what went wrong."""
-    if jobs == 1:
-        yield from (_perform(run, folder) for run in runs)
-        return
-    # Forking a process that has used PyTorch may leave its locks taken.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker) as pool:
-        futures = [pool.submit(_perform, run, folder) for run in runs]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
-def _begin_worker() -> None:
-    """One thread, and an end when the study's own process has been killed: nobody would take the results."""
-    torch.set_num_threads(1)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def _perform(run: ContactRun, folder: Path) -> str:
-    try:
-        run.measure().write(folder)
-    except Exception as error:  # whatever it is, it should not cost the other runs
-        return f"{run.name}: {type(error).__name__}: {error}"
-    return ""
-
-
-def _facts() -> dict[str, Any]:
-    """What a run was made with."""
-    return {
-        "revision": _revision(),
-        "versions": {"python": platform.python_version()}
-        | {name: importlib.metadata.version(name) for name in PACKAGES},
-        "machine": {
-            "system": platform.system(),
-            "processor": platform.machine(),
-            "cores": os.cpu_count(),
-            "threads": torch.get_num_threads(),
-        },
-    }
-
-
-def _revision() -> str:
-    """Of this package's source, with "-dirty" if it was changed; "unknown" without one."""
-    here = Path(__file__).parents[1]
-
-    def git(*arguments: str) -> "subprocess.CompletedProcess[str]":
-        return subprocess.run(["git", "-C", str(here), *arguments], capture_output=True, text=True, check=False)
-
-    try:
-        revision = git("rev-parse", "HEAD").stdout.strip()
-        return revision + "-dirty" * git("diff", "--quiet", "HEAD", "--", ".").returncode if revision else "unknown"
-    except OSError:  # there is no git here
-        return "unknown"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -6,50 +6,34 @@ were trained on the same sequences and tested on the same trajectories.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy import stats
 
 from gym_dgpmpc.agents.files import replace_text
+from gym_dgpmpc.bench import statistics
 from gym_dgpmpc.bench.contact_data import CASES
 from gym_dgpmpc.bench.contact_figures import KERNEL_NAMES, Curve, Setting, plot_fans, plot_scores_by_step
-from gym_dgpmpc.bench.contact_results import QUANTITIES, UNITS, ContactResult, read_contact_results
+from gym_dgpmpc.bench.contact_results import QUANTITIES, QUANTITY, UNITS, ContactResult, read_contact_results
 from gym_dgpmpc.bench.contact_scores import LEVELS, SCORES, coverage_name
+from gym_dgpmpc.bench.markdown import table
+from gym_dgpmpc.bench.statistics import Estimate
 
 REPORT = "contact_study.md"
 
 COMMAND = "python -m gym_dgpmpc.bench.contact run RUNS"
 """What makes all runs of the study."""
 
-QUANTITY = "angular velocity"
-"""Whose scores are told in full."""
-
 SMOOTHEST, SHALLOWEST = "rbf", 1
 """What rougher kernels and deeper models are compared with."""
 
 PROPER = {"nlpd": "NLPD", "crps": "CRPS"}
 
-CONFIDENCE, RESAMPLES = 0.95, 10_000
-
 BySeed = Mapping[int, ContactResult]
 Study = Mapping[Setting, BySeed]
 """The runs of one case."""
-
-
-class Estimate(NamedTuple):
-    """A mean over seeds and its interval; no interval from a single seed."""
-
-    value: float
-    low: float | None = None
-    high: float | None = None
-
-    def __str__(self) -> str:
-        if self.low is None or self.high is None:
-            return f"{self.value:.3f}".replace("-", "−")
-        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]".replace("-", "−")
 
 
 def report_contact_study(folder: Path, out: Path) -> list[Path]:
@@ -101,26 +85,13 @@ def paired_differences(
 
 def estimate(values: Float[ndarray, " n"]) -> Estimate:
     """The mean of one number per seed, with its bootstrap interval; NaN of none."""
-    if len(values) < 2:
-        return Estimate(float(values[0]) if len(values) else float("nan"))
-    low, high = _interval(values)
-    return Estimate(float(values.mean()), float(low), float(high))
+    return statistics.mean([values]) if len(values) else Estimate(float("nan"))
 
 
-def _interval(values: Float[ndarray, "n *b"]) -> tuple[ndarray, ndarray]:
-    """Ends of the interval of the mean over the first axis."""
-    interval = stats.bootstrap(
-        (values,),
-        lambda sample, axis: sample.mean(axis),
-        axis=0,
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        batch=1000,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return np.asarray(interval.low), np.asarray(interval.high)
+def told(value: Estimate) -> str:
+    """ "−0.120 [−0.150, −0.090]": three decimals, since a CRPS is a few hundredths."""
+    interval = "" if value.low is None else f" [{value.low:.3f}, {value.high:.3f}]"
+    return f"{value.value:.3f}{interval}".replace("-", "−")
 
 
 def _study(results: Sequence[ContactResult], case: str) -> Study:
@@ -136,7 +107,7 @@ def _study(results: Sequence[ContactResult], case: str) -> Study:
 def _curve(by_seed: BySeed, score: str) -> Curve:
     values = np.stack([result.by_step(QUANTITY, score) for result in by_seed.values()])
     mean = values.mean(axis=0)
-    low, high = _interval(values) if len(values) > 1 else (mean, mean)
+    low, high = statistics.mean_band(values) or (mean, mean)
     return mean, low, high
 
 
@@ -189,9 +160,9 @@ def _scores_table(study: Study, phase: str | None) -> list[str]:
     names = [*PROPER.values(), *(f"inside {level:.0%}" for level in LEVELS)]
     rows = []
     for (kernel, num_layers), by_seed in study.items():
-        means = [str(_over_seeds(by_seed, QUANTITY, score, phase)) for score in SCORES]
+        means = [told(_over_seeds(by_seed, QUANTITY, score, phase)) for score in SCORES]
         rows.append([KERNEL_NAMES[kernel], str(num_layers), str(len(by_seed)), *means])
-    return _table(["kernel", "L", "seeds", *names], rows)
+    return table(["kernel", "L", "seeds", *names], rows)
 
 
 def _depth_table(study: Study, phase: str | None) -> list[str]:
@@ -203,7 +174,7 @@ def _depth_table(study: Study, phase: str | None) -> list[str]:
             pairs = [((kernel, num_layers), (kernel, SHALLOWEST)) for kernel in group]
             name = KERNEL_NAMES[group[0]] if len(group) == 1 else "all kernels"
             rows += _difference_rows(study, pairs, phase, f"L = {num_layers} less L = {SHALLOWEST}", name)
-    return _table(["difference", "kernel", "seeds", *_DIFFERENCE_HEADER], rows)
+    return table(["difference", "kernel", "seeds", *_DIFFERENCE_HEADER], rows)
 
 
 def _kernel_table(study: Study, phase: str | None) -> list[str]:
@@ -217,7 +188,7 @@ def _kernel_table(study: Study, phase: str | None) -> list[str]:
             rows += _difference_rows(
                 study, pairs, phase, f"{KERNEL_NAMES[kernel]} less {KERNEL_NAMES[SMOOTHEST]}", name
             )
-    return _table(["difference", "L", "seeds", *_DIFFERENCE_HEADER], rows)
+    return table(["difference", "L", "seeds", *_DIFFERENCE_HEADER], rows)
 
 
 def _each_and_all(values: list[Any]) -> list[list[Any]]:
@@ -236,7 +207,7 @@ def _difference_rows(
     if not len(values[0]):
         return []
     found = [estimate(differences) for differences in values]
-    return [[*names, str(len(values[0])), *(text for one in found for text in (str(one), verdict(one)))]]
+    return [[*names, str(len(values[0])), *(text for one in found for text in (told(one), verdict(one)))]]
 
 
 def verdict(difference: Estimate) -> str:
@@ -255,12 +226,12 @@ def _quantities_table(study: Study) -> list[str]:
     rows = []
     for (kernel, num_layers), by_seed in study.items():
         cells = [
-            f"{_over_seeds(by_seed, quantity, score).value:.3f}".replace("-", "−")
+            told(Estimate(_over_seeds(by_seed, quantity, score).value))
             for quantity in others
             for score in (*PROPER, coverage_name(0.9))
         ]
         rows.append([KERNEL_NAMES[kernel], str(num_layers), *cells])
-    return _table(header, rows)
+    return table(header, rows)
 
 
 def _provenance(results: Sequence[ContactResult]) -> list[str]:
@@ -292,7 +263,3 @@ def _depths(results: Sequence[ContactResult]) -> list[int]:
 
 def _pairs(values: Mapping[str, object]) -> str:
     return ", ".join(f"{name} {value}" for name, value in values.items())
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    return [f"| {' | '.join(row)} |" for row in (header, ["---"] * len(header), *rows)]

@@ -21,6 +21,9 @@ SCHEMA = 1
 QUANTITIES = ("position", "angle", "velocity", "angular velocity", "change of angular velocity")
 """What is predicted and scored: the state, and the change of its last number in a step, which the paper plots."""
 
+QUANTITY = "angular velocity"
+"""Whose scores are told in full."""
+
 UNITS = ("m", "rad", "m/s", "rad/s", "rad/s")
 
 PHASES = ("before", "after")

@@ -25,6 +25,7 @@ from gym_dgpmpc.bench.contact import (
 from gym_dgpmpc.bench.contact_data import CASES, contact_test
 from gym_dgpmpc.bench.contact_results import ContactKey, ContactResult, ResultError
 from gym_dgpmpc.bench.contact_scores import crps
+from gym_dgpmpc.bench.jobs import Job
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.envs.mod_cartpole import ModCartPoleEnv
 from tests.bench.contact_runs import TINY, made_up
@@ -65,41 +66,47 @@ def test_seeds_come_outermost():
     assert len(set(keys)) == 8
 
 
+def test_a_run_is_a_job():
+    (run,) = contact_runs(["a"], ["rbf"], [1], [3], TINY)
+    assert isinstance(run, Job)
+    assert run.name == "contact study, case a | rbf, L=1 | seed 3"
+
+
 STUDY = """
 from pathlib import Path
 from gym_dgpmpc.bench.contact import run_contact_study
 from tests.bench.contact_runs import TINY
 if __name__ == "__main__":
-    run_contact_study(Path({folder!r}), ["a"], ["rbf", "matern12"], [1, 2], [100, 101], 2, TINY)
+    run_contact_study(Path({folder!r}), ["a"], ["rbf", "matern12"], [1, 2], [100, 101], 1, TINY)
 """
 
 
 def test_a_killed_study_goes_on(tmp_path):
-    """A process is killed after its first result; its workers end too, and the same call does the rest and no more."""
+    """Killed after its first result, and done in other processes by the same call: the rest, and no more."""
     folder, script = tmp_path / "study", tmp_path / "study.py"
     script.write_text(STUDY.format(folder=str(folder)))
     here = str(Path(__file__).parents[2])
     environment = os.environ | {"PYTHONPATH": here, "OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(
-        [sys.executable, str(script)], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-    )
+    process = subprocess.Popen([sys.executable, str(script)], env=environment, stderr=subprocess.PIPE)
     since = time.monotonic()
-    while not (done := list(folder.glob("*.json"))):
-        assert process.poll() is None and time.monotonic() - since < 300, process.stdout.read()
+    while not (done := list(folder.glob("contact_*.json"))):
+        assert process.poll() is None and time.monotonic() - since < 300, process.stderr.read()
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
-    process.communicate(timeout=60)  # their common output ends when the last worker has ended
+    process.communicate()
+    done = list(folder.glob("contact_*.json"))
+    assert len(done) < 8
     before = {path: path.stat().st_mtime_ns for path in done}
 
-    paths = run_contact_study(folder, ["a"], ["rbf", "matern12"], [1, 2], [100, 101], 1, TINY)
+    paths = run_contact_study(folder, ["a"], ["rbf", "matern12"], [1, 2], [100, 101], 2, TINY)
     assert len(paths) == 8 and set(paths) == set(folder.glob("contact_*.json"))
     assert {path: path.stat().st_mtime_ns for path in done} == before
-    # What another process wrote is what this one measures.
-    written = ContactResult.read(done[0])
-    measured = ContactRun(written.key, TINY).measure()
-    measured = ContactResult.read(measured.write(tmp_path / "again"))
-    for name in ("scores", "counts", "paths", "truth", "training_contact", "test_contact"):
-        assert getattr(written, name) == getattr(measured, name)
+    # What other processes wrote is what this one measures.
+    for path in (done[0], paths[-1]):
+        written = ContactResult.read(path)
+        measured = ContactResult.read(ContactRun(written.key, TINY).measure().write(tmp_path / "again"))
+        for name in ("scores", "counts", "paths", "truth", "training_contact", "test_contact"):
+            assert getattr(written, name) == getattr(measured, name)
 
 
 def test_a_run_that_fails_does_not_cost_the_others(tmp_path, monkeypatch):
@@ -111,7 +118,9 @@ def test_a_run_that_fails_does_not_cost_the_others(tmp_path, monkeypatch):
     monkeypatch.setattr(contact.ContactRun, "measure", measure)
     with pytest.raises(ContactStudyError, match=r"1 of 2 runs failed: .*case a \| rbf, L=1.*ArithmeticError: no end"):
         run_contact_study(tmp_path, ["a"], ["rbf", "matern12"], [1], [0], 1, TINY)
-    assert [path.name for path in tmp_path.iterdir()] == ["contact_a_matern12_L1_seed0.json"]
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"contact_a_matern12_L1_seed0.json", "contact_a_rbf_L1_seed0.log"}
+    assert "ArithmeticError: no end" in (tmp_path / "contact_a_rbf_L1_seed0.log").read_text()
 
 
 def test_results_of_other_settings_are_refused(tmp_path):
