@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from gym_dgpmpc.agents.files import replace_text
-from gym_dgpmpc.bench.results import ResultError
+from gym_dgpmpc.bench.results import ResultError, read_file
 
 SCHEMA = 1
 
@@ -138,21 +138,12 @@ class ContactResult:
             ResultError: the file is none, or of another schema.
             OSError: it cannot be read.
         """
-        try:
-            content = json.loads(path.read_text())
-            schema = content.pop("schema")
-            if schema != SCHEMA:
-                raise ValueError(f"its schema is {schema}, this package reads {SCHEMA}")
-            content["key"] = ContactKey(**content["key"])
-            content["settings"] = ContactSettings(**content["settings"])
-            result = cls(**content)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ResultError(
-                f"{path} is not a result of the contact study: {type(error).__name__}: {error}"
-            ) from error
-        if path.name != result.key.file_name:
-            raise ResultError(f"{path} holds the run of {result.key.file_name}")
-        return result
+
+        def parse(content: dict[str, Any]) -> ContactResult:
+            key, settings = ContactKey(**content.pop("key")), ContactSettings(**content.pop("settings"))
+            return cls(key=key, settings=settings, **content)
+
+        return read_file(path, SCHEMA, parse, "a result of the contact study")
 
 
 def read_contact_results(folder: Path) -> list[ContactResult]:

@@ -5,10 +5,10 @@ All runs lie in one folder, whichever suite asked for them, so that a run that t
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 from gym_dgpmpc.agents.files import replace_text
 from gym_dgpmpc.errors import DGPMPCError
@@ -104,19 +104,50 @@ class RunResult:
             ResultError: the file is none, or of another schema.
             OSError: it cannot be read.
         """
-        try:
-            content = json.loads(path.read_text())
-            schema = content.pop("schema")
-            if schema != SCHEMA:
-                raise ValueError(f"its schema is {schema}, this package reads {SCHEMA}")
-            content["key"] = RunKey(**content["key"])
-            content["episodes"] = tuple(Episode(**episode) for episode in content["episodes"])
-            result = cls(**content)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ResultError(f"{path} is not a result of a run: {type(error).__name__}: {error}") from error
-        if path.name != result.key.file_name:
-            raise ResultError(f"{path} holds the run of {result.key.file_name}")
-        return result
+
+        def parse(content: dict[str, Any]) -> RunResult:
+            key = RunKey(**content.pop("key"))
+            episodes = tuple(Episode(**episode) for episode in content.pop("episodes"))
+            return cls(key=key, episodes=episodes, **content)
+
+        return read_file(path, SCHEMA, parse, "a result of a run")
+
+
+Result = TypeVar("Result", bound="HasKey")
+
+
+class HasKey(Protocol):
+    """What a result file holds."""
+
+    @property
+    def key(self) -> Any:
+        """What it is of; its ``file_name`` is the file's."""
+
+
+def read_file(path: Path, schema: int, parse: Callable[[dict[str, Any]], Result], what: str) -> Result:
+    """The result in a JSON file of any kind, which says its schema and is named after its key.
+
+    Args:
+        path: of the file.
+        schema: the one that is read.
+        parse: what else the file holds -> the result.
+        what: the kind of result, for the error.
+
+    Raises:
+        ResultError: the file is none, or of another schema, or under another result's name.
+        OSError: it cannot be read.
+    """
+    try:
+        content = json.loads(path.read_text())
+        found = content.pop("schema")
+        if found != schema:
+            raise ValueError(f"its schema is {found}, this package reads {schema}")
+        result = parse(content)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ResultError(f"{path} is not {what}: {type(error).__name__}: {error}") from error
+    if path.name != result.key.file_name:
+        raise ResultError(f"{path} holds the run of {result.key.file_name}")
+    return result
 
 
 def read_results(folder: Path) -> list[RunResult]:
