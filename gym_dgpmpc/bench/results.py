@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol, TypeVar
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 from gym_dgpmpc.agents.files import replace_text
 from gym_dgpmpc.errors import DGPMPCError
@@ -116,6 +116,7 @@ class RunResult:
 Result = TypeVar("Result", bound="HasKey")
 
 
+@runtime_checkable
 class HasKey(Protocol):
     """What a result file holds."""
 
