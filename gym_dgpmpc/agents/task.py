@@ -25,7 +25,7 @@ from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
 
 Learned = Literal["learned"]
 LEARNED: Learned = "learned"
-Source = Literal["given", "the environment's", "compute_reward", "known", "never", "learned"]
+Source = Literal["given", "the environment's", "compute_reward", "known", "shaped", "never", "learned"]
 
 HARMLESS_VEC_WRAPPERS = (VecNormalize, VecMonitor, VecCheckNan)
 """What leaves observations as they are (of VecNormalize: with norm_obs=False, which is all that is let in)."""
@@ -75,8 +75,9 @@ def find_task(
     """The reward and termination to plan with, each from the first of these that has it.
 
     What the user gave; what the environment offers as an attribute (a goal environment: `compute_reward`); what is
-    known of Gymnasium's own environments; else it must be learned. The user may ask for that with "learned". An
-    environment's ``terminated_fn = None`` says that its episodes never terminate.
+    known of Gymnasium's own environments ("shaped": known, but another one is better planned with); else it must be
+    learned. The user may ask for that with "learned". An environment's ``terminated_fn = None`` says that its episodes
+    never terminate.
 
     Raises:
         ValueError: a function does not return one finite value per state of a batch, on the device of the batch.
@@ -88,8 +89,10 @@ def find_task(
         check_reward(reward_fn, *both_spaces, device)
     if terminated_fn is not None:
         check_termination(terminated_fn, *both_spaces, device)
-    is_reported = reward_source == "given" or not offered_by(env, "plans_with_another_reward")
-    return Task(reward_fn, terminated_fn, reward_source, terminated_source, is_reported)
+    is_another = reward_source == "shaped" or (
+        reward_source == "the environment's" and bool(offered_by(env, "plans_with_another_reward"))
+    )
+    return Task(reward_fn, terminated_fn, reward_source, terminated_source, not is_another)
 
 
 def _find_reward(env: VecEnv | None, given: RewardFn | Learned | None) -> tuple[RewardFn | None, Source]:
@@ -111,7 +114,9 @@ def _find_reward(env: VecEnv | None, given: RewardFn | Learned | None) -> tuple[
             )
         return goal_reward, "compute_reward"
     task = known_task(env)
-    return (None, LEARNED) if task is None or task.reward_fn is None else (task.reward_fn, "known")
+    if task is None or task.reward_fn is None:
+        return None, LEARNED
+    return (task.reward_fn, "known") if task.planning_reward_fn is None else (task.planning_reward_fn, "shaped")
 
 
 def _find_termination(env: VecEnv | None, given: TerminatedFn | Learned | None) -> tuple[TerminatedFn | None, Source]:

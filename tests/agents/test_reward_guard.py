@@ -2,6 +2,7 @@
 
 import warnings
 
+import gymnasium
 import pytest
 import torch
 
@@ -57,3 +58,12 @@ def test_a_reward_that_is_meant_to_be_another_is_not_compared(penalise_step):
     other = RiskSensitiveReward(KnownPointMass(), angle_index=0, angle_step=0.1, penalise_step=penalise_step)
     other.plans_with_another_reward = False
     assert len(guard_warnings(agent(other))) == (0 if penalise_step else 1)
+
+
+def test_a_shaped_reward_is_not_compared_and_a_given_one_is():
+    shaped = agent(gymnasium.make("InvertedPendulum-v5"), reward_fn=None)
+    assert not shaped.task.is_reported
+    assert guard_warnings(shaped) == []
+    given = agent(gymnasium.make("InvertedPendulum-v5"), reward_fn=shaped.task.reward_fn)
+    (message,) = guard_warnings(given)
+    assert "the environment returned 1" in message

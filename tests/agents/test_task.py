@@ -33,7 +33,8 @@ def far(next_observation):
     ("env_id", "expected"),
     [
         ("Pendulum-v1", ("known", "never")),
-        ("InvertedPendulum-v5", ("known", "known")),
+        ("InvertedPendulum-v5", ("shaped", "known")),
+        ("InvertedDoublePendulum-v5", ("known", "known")),
         ("HalfCheetah-v5", ("learned", "never")),
         ("Hopper-v5", ("learned", "known")),
         ("ModCartPole-v0", ("the environment's", "never")),

@@ -46,5 +46,6 @@ def test_gymnasiums_own(row):
     arguments = {name: ast.literal_eval(value) for name, value in arguments.items()}
     task = known.find(gymnasium.make(row[0].strip("`"), **arguments))
     assert row[2].split()[0].rstrip(",") == ("learned" if task.reward_fn is None else "known")
+    assert ("planned with another" in row[2]) == (task.planning_reward_fn is not None)
     assert row[3].split()[0] == ("never" if task.terminated_fn is None else "known")
     assert documented_spec(row) == task.observation_spec

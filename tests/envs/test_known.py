@@ -288,3 +288,18 @@ def test_nothing_is_known_of_other_classes_and_other_models(tmp_path):
     assert known.find(HopperEnv(xml_file=str(path))) is None
     assert known.find(gymnasium.make("Ant-v5")) is None
     assert known.find(gymnasium.make("CartPole-v1")) is None
+
+
+def test_the_shaped_reward_of_the_pole_is_best_in_the_middle_and_nothing_once_it_fell():
+    task = known.find(gymnasium.make("InvertedPendulum-v5"))
+    states = 0.15 * torch.randn(500, 4, generator=torch.Generator().manual_seed(0)).double()
+    states = torch.cat([states, torch.eye(4).double() * 1e6, torch.full((1, 4), torch.nan).double()])
+    fallen = task.terminated_fn(states)
+    assert 50 < int(fallen.sum()) < 450
+    shaped = task.planning_reward_fn(states, torch.zeros(len(states), 1), states)[~fallen]
+    assert bool((task.planning_reward_fn(states, torch.zeros(len(states), 1), states)[fallen][:-1] == 0.0).all())
+    assert bool(((shaped > 0.0) & (shaped < 1.0)).all()), "falling never pays, nor does any state as much as the middle"
+    upright = torch.zeros(1, 4).double()
+    assert task.planning_reward_fn(upright, torch.zeros(1, 1), upright).item() == 1.0
+    away = torch.linspace(0.0, 1.0, 20).double().unsqueeze(1) * torch.tensor([[1.0, 0.19, 2.0, 3.0]]).double()
+    assert bool((task.planning_reward_fn(away, torch.zeros(20, 1), away).diff() < 0.0).all())
