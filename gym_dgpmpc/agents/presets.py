@@ -60,7 +60,7 @@ STOCK = MappingProxyType(
             num_inducing=100, horizon=15, num_candidates=200, num_iterations=5, learning_starts=150
         ),
         "InvertedDoublePendulum-v5": _stock(
-            num_inducing=100, horizon=10, num_candidates=300, num_iterations=5, learning_starts=200
+            num_inducing=100, horizon=12, num_candidates=300, num_iterations=5, learning_starts=200
         ),
         "Reacher-v5": _stock(num_inducing=100, horizon=15, num_candidates=200, num_iterations=4, learning_starts=150),
         "FetchReachDense-v4": _stock(
@@ -71,7 +71,7 @@ STOCK = MappingProxyType(
 """Settings of `DGPMPCAgent` for tasks of Gymnasium and Gymnasium-Robotics, the latter without the module before the id.
 
 Horizons are long enough for what a task is about (half a swing of the pendulum, a reach) and no longer, because a plan
-that is not corrected on its way cannot balance for long: that of the double pendulum is half a second. The horizons of
+that is not corrected on its way cannot balance for long: that of the double pendulum is 0.6 s. The horizons of
 Pendulum-v1 and Reacher-v5 were tried with the true dynamics first, the others in single runs; all with seed 100.
 Episodes that end early teach little, hence the numbers of random steps. docs/environments.md has what they earn.
 """

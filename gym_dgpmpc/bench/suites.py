@@ -23,7 +23,7 @@ STOCK_TASKS = {
     "Pendulum-v1": 6,
     "Pendulum-v1:learned reward": 6,
     "InvertedPendulum-v5": 5,
-    "InvertedDoublePendulum-v5": 10,
+    "InvertedDoublePendulum-v5": 6,
     "Reacher-v5": 10,
     "Swimmer-v5": 10,
     "FetchReachDense-v4": 10,

@@ -44,7 +44,7 @@ class KnownTask(NamedTuple):
     """None: an episode never terminates. Where it does, the termination of every task here is known."""
     observation_spec: ObservationSpec
     planning_reward_fn: RewardFn | None = None
-    """What to plan with instead, where ``reward_fn`` is the same in every state that a plan can tell apart."""
+    """What to plan with instead, where ``reward_fn`` tells too late, for a plan's horizon, that things go wrong."""
 
 
 def find(env: gym.Env | EnvSpec) -> KnownTask | None:
@@ -115,7 +115,8 @@ def _inverted_double_pendulum(env: Any) -> KnownTask:
     """
     fallen = known.TipBelow(1.0)
     reward = known.DoublePendulumReward(float(env._healthy_reward), fallen)
-    return KnownTask(reward, fallen, ObservationSpec(not_inputs=(8,), constant=(8,)))
+    spec = ObservationSpec(not_inputs=(8,), constant=(8,))
+    return KnownTask(reward, fallen, spec, known.SteadyTipReward(reward))
 
 
 def _reacher(env: Any) -> KnownTask:

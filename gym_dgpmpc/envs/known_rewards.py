@@ -100,15 +100,20 @@ class CentredPoleReward:
         return alive / (1 + cost)
 
 
-def double_pendulum_tip(observation: Float[Tensor, "*b 9"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
-    """Place (x, height) of the upper pole's tip, in m.
+def _double_pendulum_angles(observation: Float[Tensor, "*b 9"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+    """Angles of the lower and the upper pole to the vertical, in rad.
 
     The observation has sine and cosine of the lower pole's angle to the vertical and of the upper pole's to the lower
     one. The angles are taken from both, so that a predicted pair that is not quite on the unit circle does not make
     the poles longer.
     """
     lower = torch.atan2(observation[..., 1], observation[..., 3])
-    upper = lower + torch.atan2(observation[..., 2], observation[..., 4])
+    return lower, lower + torch.atan2(observation[..., 2], observation[..., 4])
+
+
+def double_pendulum_tip(observation: Float[Tensor, "*b 9"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+    """Place (x, height) of the upper pole's tip, in m."""
+    lower, upper = _double_pendulum_angles(observation)
     x = observation[..., 0] + POLE_LENGTH * (lower.sin() + upper.sin())
     return x, POLE_LENGTH * (lower.cos() + upper.cos())
 
@@ -144,6 +149,26 @@ class DoublePendulumReward:
         distance = 0.01 * x.square() + (height - 2).square()
         speed = 1e-3 * next_observation[..., 6].square() + 5e-3 * next_observation[..., 7].square()
         return self.healthy_reward * alive - distance - speed
+
+
+@dataclass(frozen=True)
+class SteadyTipReward:
+    """The double pendulum's reward less 3 x^2 + 2 speed^2 of the tip along the rail, but at least 0: to plan with.
+
+    The tip, not the cart: a cart that is drawn to the middle by itself leaves the poles behind.
+    """
+
+    reward_fn: DoublePendulumReward
+
+    def __call__(
+        self, observation: Float[Tensor, "*b 9"], action: Float[Tensor, "*b 1"], next_observation: Float[Tensor, "*b 9"]
+    ) -> Float[Tensor, "*b"]:
+        """The reward of each step."""
+        lower, upper = _double_pendulum_angles(next_observation)
+        cart_speed, lower_rate, elbow_rate = next_observation[..., 5:8].unbind(-1)
+        speed = cart_speed + POLE_LENGTH * (lower.cos() * lower_rate + upper.cos() * (lower_rate + elbow_rate))
+        unsteady = 3 * double_pendulum_tip(next_observation)[0].square() + 2 * speed.square()
+        return (self.reward_fn(observation, action, next_observation) - unsteady).clamp_min(0.0)
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ def far(next_observation):
     [
         ("Pendulum-v1", ("known", "never")),
         ("InvertedPendulum-v5", ("shaped", "known")),
-        ("InvertedDoublePendulum-v5", ("known", "known")),
+        ("InvertedDoublePendulum-v5", ("shaped", "known")),
         ("HalfCheetah-v5", ("learned", "never")),
         ("Hopper-v5", ("learned", "known")),
         ("ModCartPole-v0", ("the environment's", "never")),

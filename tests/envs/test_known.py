@@ -303,3 +303,23 @@ def test_the_shaped_reward_of_the_pole_is_best_in_the_middle_and_nothing_once_it
     assert task.planning_reward_fn(upright, torch.zeros(1, 1), upright).item() == 1.0
     away = torch.linspace(0.0, 1.0, 20).double().unsqueeze(1) * torch.tensor([[1.0, 0.19, 2.0, 3.0]]).double()
     assert bool((task.planning_reward_fn(away, torch.zeros(20, 1), away).diff() < 0.0).all())
+
+
+def test_the_shaped_reward_of_the_double_pendulum_has_the_tips_speed():
+    """Against the tip's way in a short time, as the simulator has it."""
+    env = gymnasium.make("InvertedDoublePendulum-v5")
+    task, data = known.find(env), env.unwrapped.data
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        env.unwrapped.set_state(rng.uniform(-0.4, 0.4, 3), rng.uniform(-1.0, 1.0, 3))
+        state, before = torch.from_numpy(env.unwrapped._get_obs()).unsqueeze(0), data.site_xpos[0].copy()
+        tip = double_pendulum_tip(state)[0].item()
+        assert tip == pytest.approx(before[0], abs=1e-12)
+        time = 1e-6
+        data.qpos[:] += time * data.qvel
+        mujoco.mj_kinematics(env.unwrapped.model, data)
+        speed = (data.site_xpos[0][0] - before[0]) / time
+        own = task.reward_fn(state, torch.zeros(1, 1), state).item()
+        shaped = task.planning_reward_fn(state, torch.zeros(1, 1), state).item()
+        assert shaped == pytest.approx(max(0.0, own - 3 * tip**2 - 2 * speed**2), abs=1e-4)
