@@ -18,12 +18,10 @@ from gym_dgpmpc.bench.contact_data import CASES
 from gym_dgpmpc.bench.contact_figures import KERNEL_NAMES, Curve, Setting, plot_fans, plot_scores_by_step
 from gym_dgpmpc.bench.contact_results import QUANTITIES, QUANTITY, UNITS, ContactResult, read_contact_results
 from gym_dgpmpc.bench.contact_scores import LEVELS, SCORES, coverage_name
-from gym_dgpmpc.bench.markdown import table
+from gym_dgpmpc.bench.markdown import page_and_folder, table
 from gym_dgpmpc.bench.statistics import Estimate
 
-REPORT = "contact_study.md"
-
-COMMAND = "python -m gym_dgpmpc.bench.contact run RUNS"
+COMMAND = "dgpmpc bench contact"
 """What makes all runs of the study."""
 
 SMOOTHEST, SHALLOWEST = "rbf", 1
@@ -37,30 +35,31 @@ Study = Mapping[Setting, BySeed]
 
 
 def report_contact_study(folder: Path, out: Path) -> list[Path]:
-    """Write the report `contact_study.md` and its figures into ``out``, and return all files.
+    """Write the report ``out``.md, its figures into the folder ``out``, and return all files, the page first.
 
     Args:
-        folder: where `run_contact_study` left its files; not all of its runs need be there.
-        out: made if there is none.
+        folder: of the study's results; not all of its runs need be there.
+        out: with or without the suffix ".md".
 
     Raises:
         ResultError: a file is damaged, there is none, or they are not of one study.
     """
     results = read_contact_results(folder)
-    out.mkdir(parents=True, exist_ok=True)
+    page, figures = page_and_folder(out)
+    figures.mkdir(parents=True, exist_ok=True)
     lines, written = _head(results), []
     for case in sorted({result.key.case for result in results}):
         study = _study(results, case)
-        fans, steps = out / f"fans_{case}.png", out / f"steps_{case}.png"
+        fans, steps = figures / f"fans_{case}.png", figures / f"steps_{case}.png"
         seed = min(seed for by_seed in study.values() for seed in by_seed)
         plot_fans({setting: by_seed[seed] for setting, by_seed in study.items() if seed in by_seed}, fans)
         curves = {score: {setting: _curve(by_seed, score) for setting, by_seed in study.items()} for score in SCORES}
         title = f"Case {case}: {CASES[case].title}; {QUANTITY} predicted open-loop"
         plot_scores_by_step(curves, QUANTITY, title, steps)
         written += [fans, steps]
-        lines += _section(case, study, fans.name, steps.name)
-    replace_text(out / REPORT, "\n".join([*lines, *_provenance(results)]) + "\n")
-    return [out / REPORT, *written]
+        lines += _section(case, study, f"{figures.name}/{fans.name}", f"{figures.name}/{steps.name}")
+    replace_text(page, "\n".join([*lines, *_provenance(results)]) + "\n")
+    return [page, *written]
 
 
 def paired_differences(

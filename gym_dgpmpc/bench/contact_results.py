@@ -146,6 +146,11 @@ class ContactResult:
         return read_file(path, SCHEMA, parse, "a result of the contact study")
 
 
+def holds_contact_study(folder: Path) -> bool:
+    """Whether a folder has results of the study, rather than of runs."""
+    return any(folder.glob(_FILES))
+
+
 def read_contact_results(folder: Path) -> list[ContactResult]:
     """All results in a folder, in the order of their names.
 

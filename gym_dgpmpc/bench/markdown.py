@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 from gym_dgpmpc.bench.statistics import Estimate
 
@@ -43,3 +44,9 @@ def estimate(value: Estimate) -> str:
 
 def _line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
+
+
+def page_and_folder(out: Path) -> tuple[Path, Path]:
+    """The files of a report: the page ``out``.md, and the folder ``out`` of its figures; ``out`` with ".md" or not."""
+    name = out.name.removesuffix(".md")
+    return out.with_name(f"{name}.md"), out.with_name(name)

@@ -7,6 +7,7 @@ from pathlib import Path
 from gym_dgpmpc.agents.files import replace_text
 from gym_dgpmpc.bench import charts, paper, scores, tables
 from gym_dgpmpc.bench.curves import MOST_POINTS
+from gym_dgpmpc.bench.markdown import page_and_folder
 from gym_dgpmpc.bench.provenance import Origins
 from gym_dgpmpc.bench.results import ResultError
 from gym_dgpmpc.bench.scores import CEILING, Runs
@@ -82,8 +83,8 @@ def write_report(
     if unknown:
         raise ValueError(f"a threshold is given for {', '.join(unknown)}, of which there are no runs")
     references = scores.reference_of(study, reference)
-    page_file = out.with_name(f"{out.name.removesuffix('.md')}.md")
-    page = _Page(out.with_name(out.name.removesuffix(".md")), Origins(study))
+    page_file, figures = page_and_folder(out)
+    page = _Page(figures, Origins(study))
     runs = sum(len(results) for of_task in study.values() for results in of_task.values())
     page.add("# Results")
     page.add(f"Made from {runs} result files in `{folder}`" + (f" by `{command}`." if command else "."))

@@ -38,7 +38,9 @@ def report(
         ),
     ] = None,
 ) -> None:
-    """Make tables and figures from the result files of a folder."""
+    """Make tables and figures from the result files of a folder: of runs, or of the contact study."""
+    from gym_dgpmpc.bench.contact_report import report_contact_study
+    from gym_dgpmpc.bench.contact_results import holds_contact_study
     from gym_dgpmpc.bench.report import write_report
 
     thresholds = dict(map(_threshold, threshold or ()))
@@ -46,7 +48,14 @@ def report(
     given = [part for name, values in options.items() for value in values or () if value for part in (name, value)]
     command = shlex.join(["dgpmpc", "report", str(folder), *given])
     try:
-        files = write_report(folder, out, tasks=task or (), reference=reference, thresholds=thresholds, command=command)
+        if holds_contact_study(folder):
+            if task or reference or threshold:
+                raise ValueError("the report of the contact study is of all of it: of the options it has --out alone")
+            files = report_contact_study(folder, out)
+        else:
+            files = write_report(
+                folder, out, tasks=task or (), reference=reference, thresholds=thresholds, command=command
+            )
     except (DGPMPCError, ValueError, OSError) as error:
         typer.echo(f"error: {' '.join(str(error).split())}", err=True)
         raise typer.Exit(EXIT_ERROR) from error

@@ -1,11 +1,15 @@
 """The suites, as data: which methods run on which tasks, for how many episodes and with which seeds."""
 
 import shlex
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
+from gym_dgpmpc.bench.contact import ContactRun
+from gym_dgpmpc.bench.contact_data import CASES
+from gym_dgpmpc.bench.contact_results import ContactKey, ContactSettings
 from gym_dgpmpc.bench.jobs import Job
 from gym_dgpmpc.bench.methods import dgp_mpc
 from gym_dgpmpc.bench.run import Run
@@ -54,6 +58,10 @@ class Suite(Protocol):
     def title(self) -> str:
         """On one line, for a person."""
 
+    @property
+    def results(self) -> Path:
+        """Folder of the results, unless another one is asked for; a report is made of a folder."""
+
     def jobs(self, narrowed: Narrowed) -> Sequence[Job]:
         """Those that are asked for.
 
@@ -82,12 +90,14 @@ class RunSuite:
         title: on one line, for a person.
         cells: methods on tasks.
         seeds: of each.
+        results: folder; of all suites of runs the same, since they share runs.
     """
 
     name: str
     title: str
     cells: tuple[Cell, ...]
     seeds: tuple[int, ...] = PAPER_SEEDS
+    results: Path = Path("benchmarks/results/runs")
 
     def jobs(self, narrowed: Narrowed) -> list[Run]:
         """The runs, seeds outermost, so that an interrupted suite has every cell with some seeds.
@@ -115,6 +125,35 @@ class RunSuite:
             cell.steps_of,
             command=shlex.join(["dgpmpc", "bench", self.name, *options]),
         )
+
+
+@dataclass(frozen=True)
+class ContactSuite:
+    """The contact study: its tasks are its cases, its methods are depths and kernels; nothing in it has episodes."""
+
+    title: str = "deep Gaussian processes that predict a cart at the end of its rail: 4 kernels, L = 1, 2, 3, 3 cases"
+    results: Path = Path("benchmarks/results/contact")
+    settings: ContactSettings = field(default_factory=ContactSettings)
+
+    def jobs(self, narrowed: Narrowed) -> list[ContactRun]:
+        """The runs, seeds outermost.
+
+        Raises:
+            SuiteError: a case or a model that is asked for is not in the study, or episodes are.
+        """
+        if narrowed.episodes is not None:
+            raise SuiteError(f"the contact study has no episodes, asked for are {narrowed.episodes}")
+        cases = {f"case {name}": name for name in CASES}
+        models = {f"DGP L={depth} {kernel}": (kernel, depth) for kernel in PAPER_KERNELS for depth in PAPER_LAYERS}
+        tasks = _chosen("task", cases, narrowed.tasks)
+        methods = _chosen("method", models, narrowed.methods)
+        return [
+            ContactRun(ContactKey(case, *model, seed), self.settings)
+            for seed in (PAPER_SEEDS if narrowed.seeds is None else narrowed.seeds)
+            for task, case in cases.items()
+            for method, model in models.items()
+            if task in tasks and method in methods
+        ]
 
 
 def _chosen(what: str, names: Iterable[str], asked: Sequence[str] | None) -> set[str]:
@@ -148,49 +187,47 @@ def _stock() -> tuple[Cell, ...]:
 
 _COMPARED = (dgp_mpc(2, "matern32"), dgp_mpc(3, "matern32"), *BASELINES)
 
-SUITES: dict[str, Suite] = {
-    suite.name: suite
-    for suite in (
-        RunSuite(
-            "table",
-            "average episode return by kernel and layers on the paper's three tasks",
-            _paper(dgp_mpc(layers, kernel) for kernel in PAPER_KERNELS for layers in PAPER_LAYERS),
+_OF_RUNS = (
+    RunSuite(
+        "table",
+        "average episode return by kernel and layers on the paper's three tasks",
+        _paper(dgp_mpc(layers, kernel) for kernel in PAPER_KERNELS for layers in PAPER_LAYERS),
+    ),
+    RunSuite(
+        "comparison",
+        "every method on the paper's three tasks, and the true dynamics as the ceiling",
+        _paper((*_COMPARED, "true dynamics")),
+    ),
+    RunSuite(
+        "variance",
+        "how much the average episode return of every method varies over seeds",
+        _paper(_COMPARED),
+    ),
+    RunSuite(
+        "unmodified",
+        "the cart-pole in the middle of its rail: RBF kernels, and PETS as published",
+        (
+            *(Cell(dgp_mpc(layers, "rbf"), "SwingUpCartPole-v0", 15) for layers in PAPER_LAYERS),
+            Cell("PETS as published", "SwingUpCartPole-v0", 15),
         ),
-        RunSuite(
-            "comparison",
-            "every method on the paper's three tasks, and the true dynamics as the ceiling",
-            _paper((*_COMPARED, "true dynamics")),
+    ),
+    RunSuite(
+        "long-cheetah",
+        "the half cheetah beyond small samples",
+        tuple(
+            Cell(dgp_mpc(layers, "matern32"), "RiskSensitiveHalfCheetah-v0:50 episodes", 50) for layers in PAPER_LAYERS
         ),
-        RunSuite(
-            "variance",
-            "how much the average episode return of every method varies over seeds",
-            _paper(_COMPARED),
-        ),
-        RunSuite(
-            "unmodified",
-            "the cart-pole in the middle of its rail: RBF kernels, and PETS as published",
-            (
-                *(Cell(dgp_mpc(layers, "rbf"), "SwingUpCartPole-v0", 15) for layers in PAPER_LAYERS),
-                Cell("PETS as published", "SwingUpCartPole-v0", 15),
-            ),
-        ),
-        RunSuite(
-            "long-cheetah",
-            "the half cheetah beyond small samples",
-            tuple(
-                Cell(dgp_mpc(layers, "matern32"), "RiskSensitiveHalfCheetah-v0:50 episodes", 50)
-                for layers in PAPER_LAYERS
-            ),
-        ),
-        RunSuite(
-            "stock",
-            f"Gymnasium's own tasks, against SAC with {STOCK_TIMES} times the steps",
-            _stock(),
-            seeds=(0, 1, 2),
-        ),
-    )
-}
-"""By name. A suite of jobs that are not runs is one more entry: an object with a title and `jobs`."""
+    ),
+    RunSuite(
+        "stock",
+        f"Gymnasium's own tasks, against SAC with {STOCK_TIMES} times the steps",
+        _stock(),
+        seeds=(0, 1, 2),
+    ),
+)
+
+SUITES: Mapping[str, Suite] = {**{suite.name: suite for suite in _OF_RUNS}, "contact": ContactSuite()}
+"""By name."""
 
 
 def find_suite(name: str) -> Suite:

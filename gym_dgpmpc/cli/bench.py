@@ -24,7 +24,9 @@ WHERE = "Where"
 def bench(
     suite: Annotated[
         str,
-        typer.Argument(metavar="SUITE", help="table, comparison, variance, unmodified, long-cheetah or stock."),
+        typer.Argument(
+            metavar="SUITE", help="table, comparison, variance, unmodified, long-cheetah, stock or contact."
+        ),
     ],
     show: Annotated[
         bool, typer.Option("--list", help="Only say what is finished, what is left and how long it may take.")
@@ -60,8 +62,13 @@ def bench(
         ),
     ] = None,
     results: Annotated[
-        Path, typer.Option(help="Folder of the result files, one per run.", rich_help_panel=WHERE)
-    ] = Path("benchmarks/results/runs"),
+        Path | None,
+        typer.Option(
+            help="Folder of the result files, one per run.",
+            show_default="benchmarks/results/runs, or contact in place of runs",
+            rich_help_panel=WHERE,
+        ),
+    ] = None,
     work: Annotated[Path, typer.Option(help="Folder that unfinished runs go on from.", rich_help_panel=WHERE)] = Path(
         "runs/bench"
     ),
@@ -77,8 +84,9 @@ def bench(
 
     with one_line_errors(ValueError, OSError):
         narrowed = Narrowed(_numbers(seeds), _names(tasks), _names(methods), episodes)
-        wanted = find_suite(suite).jobs(narrowed)
-        folders = Folders(results.resolve(), work.resolve())
+        chosen = find_suite(suite)
+        wanted = chosen.jobs(narrowed)
+        folders = Folders((results or chosen.results).resolve(), work.resolve())
         lines = survey(wanted, folders)
         if show:
             for line in lines:

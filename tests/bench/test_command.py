@@ -102,7 +102,7 @@ def test_an_interrupted_suite_goes_on(bench, monkeypatch):
 
 def test_jobs_that_are_no_runs(bench, monkeypatch, tmp_path):
     class Errands:
-        title = "errands"
+        title, results = "errands", tmp_path
 
         def jobs(self, narrowed):
             return [Errand(f"errand {seed}", str(tmp_path / "diary")) for seed in narrowed.seeds or (0,)]

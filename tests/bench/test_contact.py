@@ -11,24 +11,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
-from gym_dgpmpc.bench import contact
-from gym_dgpmpc.bench.contact import (
-    ContactRun,
-    ContactStudyError,
-    contact_runs,
-    main,
-    open_loop,
-    quantities,
-    run_contact_study,
-)
+from gym_dgpmpc.bench import suites
+from gym_dgpmpc.bench.contact import ContactRun, open_loop, quantities
 from gym_dgpmpc.bench.contact_data import CASES, contact_test
 from gym_dgpmpc.bench.contact_results import ContactKey, ContactResult, ResultError
 from gym_dgpmpc.bench.contact_scores import crps
-from gym_dgpmpc.bench.jobs import Job
+from gym_dgpmpc.bench.jobs import Folders, Job, carry_out
+from gym_dgpmpc.bench.suites import ContactSuite, Narrowed, SuiteError
+from gym_dgpmpc.cli import app
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.envs.mod_cartpole import ModCartPoleEnv
 from tests.bench.contact_runs import TINY, made_up
+
+TINY_SUITE = ContactSuite(settings=TINY)
 
 
 def test_the_true_dynamics_roll_out_the_truth():
@@ -59,30 +56,41 @@ def test_a_run_scores_what_it_keeps():
     assert result.training["iterations"] == TINY.first_iterations and result.fit_seconds > 0
 
 
-def test_seeds_come_outermost():
-    keys = [run.key for run in contact_runs(["a", "b"], ["rbf"], [1, 2], [3, 4], TINY)]
-    assert keys[0] == ContactKey("a", "rbf", 1, 3)
-    assert [key.seed for key in keys] == [3] * 4 + [4] * 4
-    assert len(set(keys)) == 8
+def test_a_study_is_narrowed_as_every_suite_and_its_seeds_come_outermost():
+    jobs = TINY_SUITE.jobs(Narrowed(seeds=[3, 4], tasks=["case [ab]"], methods=["DGP L=[12] rbf"]))
+    assert jobs[0].key == ContactKey("a", "rbf", 1, 3) and isinstance(jobs[0], Job)
+    assert jobs[0].name == "contact study, case a | rbf, L=1 | seed 3"
+    assert [job.key.seed for job in jobs] == [3] * 4 + [4] * 4
+    assert len({job.key for job in jobs}) == 8
+    assert len({job.key for job in ContactSuite().jobs(Narrowed())}) == 3 * 4 * 3 * 10
 
 
-def test_a_run_is_a_job():
-    (run,) = contact_runs(["a"], ["rbf"], [1], [3], TINY)
-    assert isinstance(run, Job)
-    assert run.name == "contact study, case a | rbf, L=1 | seed 3"
+@pytest.mark.parametrize(
+    ("narrowed", "message"),
+    [
+        (Narrowed(tasks=["case d"]), "there is no task 'case d' in this suite; there are case a, case b, case c"),
+        (Narrowed(methods=["*cubic"]), "there is no method .*; there are DGP L=1 matern12"),
+        (Narrowed(episodes=3), "has no episodes, asked for are 3"),
+    ],
+)
+def test_what_is_not_in_the_study_is_refused(narrowed, message):
+    with pytest.raises(SuiteError, match=message):
+        TINY_SUITE.jobs(narrowed)
 
 
+PART = Narrowed(seeds=[100, 101], tasks=["case a"], methods=["DGP L=[12] rbf", "DGP L=[12] matern12"])
 STUDY = """
 from pathlib import Path
-from gym_dgpmpc.bench.contact import run_contact_study
-from tests.bench.contact_runs import TINY
+from gym_dgpmpc.bench.jobs import Folders, carry_out
+from tests.bench.test_contact import PART, TINY_SUITE
 if __name__ == "__main__":
-    run_contact_study(Path({folder!r}), ["a"], ["rbf", "matern12"], [1, 2], [100, 101], 1, TINY)
+    for job in TINY_SUITE.jobs(PART):
+        carry_out(job, Folders(Path({folder!r}), Path({folder!r})))
 """
 
 
 def test_a_killed_study_goes_on(tmp_path):
-    """Killed after its first result, and done in other processes by the same call: the rest, and no more."""
+    """Killed after its first result, and done in another process: the rest, and no more."""
     folder, script = tmp_path / "study", tmp_path / "study.py"
     script.write_text(STUDY.format(folder=str(folder)))
     here = str(Path(__file__).parents[2])
@@ -98,8 +106,11 @@ def test_a_killed_study_goes_on(tmp_path):
     assert len(done) < 8
     before = {path: path.stat().st_mtime_ns for path in done}
 
-    paths = run_contact_study(folder, ["a"], ["rbf", "matern12"], [1, 2], [100, 101], 2, TINY)
-    assert len(paths) == 8 and set(paths) == set(folder.glob("contact_*.json"))
+    outcomes = [carry_out(job, Folders(folder, folder)) for job in TINY_SUITE.jobs(PART)]
+    assert [outcome.told == "finished already" for outcome in outcomes].count(True) == len(done)
+    assert not any(outcome.failure for outcome in outcomes)
+    paths = sorted(folder.glob("contact_*.json"))
+    assert len(paths) == 8
     assert {path: path.stat().st_mtime_ns for path in done} == before
     # What other processes wrote is what this one measures.
     for path in (done[0], paths[-1]):
@@ -109,53 +120,49 @@ def test_a_killed_study_goes_on(tmp_path):
             assert getattr(written, name) == getattr(measured, name)
 
 
-def test_a_run_that_fails_does_not_cost_the_others(tmp_path, monkeypatch):
+def test_results_of_other_settings_are_refused(tmp_path):
+    made_up(ContactKey("a", "rbf", 1, 0), 1.0).write(tmp_path)
+    job = ContactSuite().jobs(Narrowed(seeds=[0]))[0]
+    with pytest.raises(ResultError, match=r"seed0.json is of a study with other settings: num_inducing 15 instead of"):
+        job.is_finished(tmp_path)
+
+
+@pytest.fixture
+def made_up_suite(monkeypatch, tmp_path):
+    """The command's suite measures nothing, fails with the RBF kernel, and stands in a folder of its own."""
+
     def measure(run):
         if run.key.kernel == "rbf":
             raise ArithmeticError("no end")
         return made_up(run.key, 1.0)
 
-    monkeypatch.setattr(contact.ContactRun, "measure", measure)
-    with pytest.raises(ContactStudyError, match=r"1 of 2 runs failed: .*case a \| rbf, L=1.*ArithmeticError: no end"):
-        run_contact_study(tmp_path, ["a"], ["rbf", "matern12"], [1], [0], 1, TINY)
-    left = {path.name for path in tmp_path.iterdir()}
+    monkeypatch.setattr(ContactRun, "measure", measure)
+    monkeypatch.setitem(suites.SUITES, "contact", TINY_SUITE)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "benchmarks" / "results" / "contact"
+
+
+def test_the_command_line_runs_and_reports(made_up_suite):
+    options = ["--tasks", "case b", "--methods", "*matern12", "--seeds", "0"]
+    told = CliRunner().invoke(app, ["bench", "contact", *options], catch_exceptions=False)
+    assert told.exit_code == 0 and "3 jobs: 0 finished, 3 left" in told.output
+    assert {path.name for path in made_up_suite.iterdir()} == {
+        f"contact_b_matern12_L{depth}_seed0.json" for depth in (1, 2, 3)
+    }
+    told = CliRunner().invoke(app, ["report", str(made_up_suite), "--out", "page"], catch_exceptions=False)
+    assert told.exit_code == 0 and told.output == "page.md and 2 figures in page\n"
+    assert "](page/fans_b.png)" in Path("page.md").read_text() and Path("page/fans_b.png").exists()
+    told = CliRunner().invoke(app, ["report", str(made_up_suite), "--task", "a"])
+    assert told.exit_code == 2 and "has --out alone" in told.output
+    (made_up_suite / "contact_b_matern12_L1_seed0.json").write_text("{}")
+    told = CliRunner().invoke(app, ["report", str(made_up_suite)])
+    assert told.exit_code == 2 and "is not a result of the contact study" in " ".join(told.output.split())
+
+
+def test_a_run_that_fails_does_not_cost_the_others(made_up_suite):
+    options = ["--tasks", "case a", "--methods", "DGP L=1 rbf,DGP L=1 matern12", "--seeds", "0"]
+    told = CliRunner().invoke(app, ["bench", "contact", *options])
+    assert told.exit_code == 1 and "case a | rbf, L=1 | seed 0: ArithmeticError: no end" in told.output
+    left = {path.name for path in made_up_suite.iterdir()}
     assert left == {"contact_a_matern12_L1_seed0.json", "contact_a_rbf_L1_seed0.log"}
-    assert "ArithmeticError: no end" in (tmp_path / "contact_a_rbf_L1_seed0.log").read_text()
-
-
-def test_results_of_other_settings_are_refused(tmp_path):
-    made_up(ContactKey("a", "rbf", 1, 0), 1.0).write(tmp_path)
-    with pytest.raises(ResultError, match=r"seed0.json is of a study with other settings: num_inducing 15 instead of"):
-        run_contact_study(tmp_path, ["a"], ["rbf"], [1], [0])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"cases": ["d"]}, "unknown case 'd'"),
-        ({"kernels": ["cubic"]}, "unknown kernel 'cubic'"),
-        ({"layers": [0]}, r"layers must be at least 1 and seeds at least 0, received \[0\]"),
-        ({"seeds": [-1]}, "seeds at least 0"),
-        ({"jobs": 0}, "jobs must be at least 1, received 0"),
-    ],
-)
-def test_what_is_no_study_is_refused(tmp_path, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        run_contact_study(tmp_path, **arguments)
-
-
-def test_the_command_line_runs_and_reports(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(contact.ContactRun, "measure", lambda run: made_up(run.key, 1.0))
-    monkeypatch.setattr(contact, "ContactSettings", lambda: TINY)
-    folder, out = str(tmp_path / "runs"), str(tmp_path / "report")
-    main(["run", folder, "--cases", "b", "--kernels", "rbf", "--layers", "1", "2", "--seeds", "0"])
-    assert len(list((tmp_path / "runs").iterdir())) == 2
-    main(["report", folder, out])
-    told = capsys.readouterr().out.splitlines()
-    assert told[0].endswith("contact_b_rbf_L1_seed0.json and 1 other files")
-    assert told[1] == f"{tmp_path / 'report' / 'contact_study.md'} and 2 other files"
-    (tmp_path / "runs" / "contact_b_rbf_L1_seed0.json").write_text("{}")
-    with pytest.raises(SystemExit, match="is not a result of the contact study"):
-        main(["report", folder, out])
-    with pytest.raises(SystemExit, match="layers must be at least 1"):
-        main(["run", folder, "--layers", "0"])
+    assert "ArithmeticError: no end" in (made_up_suite / "contact_a_rbf_L1_seed0.log").read_text()

@@ -89,12 +89,12 @@ def test_a_report_holds_levels_and_differences(tmp_path):
         run.write(tmp_path / "runs")
     files = report_contact_study(tmp_path / "runs", tmp_path / "out")
     assert [path.name for path in files] == [
-        "contact_study.md", "fans_a.png", "steps_a.png", "fans_b.png", "steps_b.png",
+        "out.md", "fans_a.png", "steps_a.png", "fans_b.png", "steps_b.png",
     ]  # fmt: skip
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in files[1:])
     text = files[0].read_text()
     for picture in files[1:]:
-        assert f"]({picture.name})" in text
+        assert f"](out/{picture.name})" in text
     assert "| L = 2 less L = 1 | RBF | 4 | −1.000 [−1.000, −1.000] | better |" in text
     assert "| L = 2 less L = 1 | all kernels | 4 | −0.750 [−0.750, −0.750] | better |" in text
     assert "| Matérn-1/2 less RBF | 2 | 4 | −2.500 [−2.500, −2.500] | better |" in text
