@@ -39,7 +39,7 @@ TD3_NOISE = 0.1
 """Standard deviation of the exploration of Fujimoto et al. (2018), in half the width of the action range."""
 
 _FASTER: Mapping[str, Any] = {"half_precision": True}
-"""A third of the time where the processor has instructions for it; docs/deviations.md has what it does to a prediction."""
+"""A third of the time where the processor has instructions for it; what it does to predictions: docs/deviations.md."""
 
 Settings = dict[str, Any]
 Presets = Callable[[Task], Mapping[str, Any]]
