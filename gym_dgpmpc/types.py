@@ -31,7 +31,7 @@ class Transitions(NamedTuple):
 
 @dataclass(frozen=True)
 class ObservationSpec:
-    """How a dynamics model should read an observation. All fields are indices into the observation.
+    """How a dynamics model should read an observation. All fields hold indices into the observation.
 
     Attributes:
         angles: enter the model as sine and cosine (the predicted change stays in radians).
@@ -39,12 +39,17 @@ class ObservationSpec:
         not_inputs: predicted, but not fed to the model.
         constant: fixed within an episode; passed through unmodelled (they stay model inputs unless also in
             ``not_inputs``).
+        body_frame: triples (heading, x, y): a vector that is observed along fixed axes, such as places and velocities
+            on a floor, and the angle in rad, anticlockwise, of the body to them. The model is fed the vector, and
+            predicts its change, along the body's axes: what was learned under one heading then holds under all. Where
+            nothing else depends on the heading, put it in ``not_inputs``.
     """
 
     angles: tuple[int, ...] = ()
     absolute: tuple[int, ...] = ()
     not_inputs: tuple[int, ...] = ()
     constant: tuple[int, ...] = ()
+    body_frame: tuple[tuple[int, int, int], ...] = ()
 
 
 @runtime_checkable

@@ -65,10 +65,17 @@ class ModelledVector:
 
     @property
     def spec(self) -> ObservationSpec:
-        """How to read the vector: what was added is predicted as it is, and no input."""
+        """How to read the vector: what was added is predicted as it is, and no input.
+
+        The headings of vectors are inputs then, for a reward may depend on them where the dynamics do not.
+        """
         added = tuple(range(self.observation_size, self.size))
         spec = self.observation_spec
-        return replace(spec, absolute=(*spec.absolute, *added), not_inputs=(*spec.not_inputs, *added))
+        if not added:
+            return spec
+        headings = {heading for heading, _, _ in spec.body_frame}
+        not_inputs = (*(i for i in spec.not_inputs if i not in headings), *added)
+        return replace(spec, absolute=(*spec.absolute, *added), not_inputs=not_inputs)
 
     def transitions(self, store: TransitionStore) -> Transitions:
         """The stored transitions as the model sees them."""

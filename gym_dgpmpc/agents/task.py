@@ -75,7 +75,7 @@ def find_task(
     """The reward and termination to plan with, each from the first of these that has it.
 
     What the user gave; what the environment offers as an attribute (a goal environment: `compute_reward`); what is
-    known of Gymnasium's own environments ("shaped": known, but another one is better planned with); else it must be
+    known of Gymnasium's own environments ("shaped": another reward is better planned with); else it must be
     learned. The user may ask for that with "learned". An environment's ``terminated_fn = None`` says that its episodes
     never terminate.
 
@@ -114,9 +114,11 @@ def _find_reward(env: VecEnv | None, given: RewardFn | Learned | None) -> tuple[
             )
         return goal_reward, "compute_reward"
     task = known_task(env)
-    if task is None or task.reward_fn is None:
+    if task is None:
         return None, LEARNED
-    return (task.reward_fn, "known") if task.planning_reward_fn is None else (task.planning_reward_fn, "shaped")
+    if task.planning_reward_fn is not None:
+        return task.planning_reward_fn, "shaped"
+    return task.reward_fn, LEARNED if task.reward_fn is None else "known"
 
 
 def _find_termination(env: VecEnv | None, given: TerminatedFn | Learned | None) -> tuple[TerminatedFn | None, Source]:

@@ -1,11 +1,13 @@
 """What a dynamics model reads and predicts: the map between raw observations and model inputs and targets.
 
 Sits between the transition store and every dynamics model. An `ObservationSpec` decides it: angles become sine and
-cosine (a stationary kernel then sees that 0 and 2 pi are one place), changes are predicted rather than values
-unless a dimension is absolute, constant dimensions are not modelled at all.
+cosine (a stationary kernel then sees that 0 and 2 pi are one place), vectors are turned into the body's frame, changes
+are predicted rather than values unless a dimension is absolute, constant dimensions are not modelled at all.
 """
 
 import math
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -14,11 +16,40 @@ from torch import Tensor
 from gym_dgpmpc.types import ObservationSpec
 
 
+class VectorColumns(NamedTuple):
+    """Where the k vectors of `ObservationSpec.body_frame` stand: headings in an observation, x and y in any tensor."""
+
+    headings: list[int]
+    x: list[int]
+    y: list[int]
+
+    @classmethod
+    def of(cls, body_frame: Iterable[tuple[int, int, int]]) -> "VectorColumns":
+        """The columns of the observation itself."""
+        frames = list(body_frame)
+        return cls(*([frame[i] for frame in frames] for i in range(3)))
+
+    def turned(
+        self, values: Float[Tensor, "*b n"], observation: Float[Tensor, "*b S"], sense: float
+    ) -> Float[Tensor, "*b n"]:
+        """The values, each vector turned by its heading, from the body's axes to the fixed ones (-1: back)."""
+        if not self.headings:
+            return values
+        angle = observation[..., self.headings]
+        cosine, sine = angle.cos(), sense * angle.sin()
+        x, y = values[..., self.x], values[..., self.y]
+        out = values.clone()
+        out[..., self.x] = cosine * x - sine * y
+        out[..., self.y] = sine * x + cosine * y
+        return out
+
+
 class Encoder:
     """Maps (observation, action) to a model's inputs, (observation, next observation) to its targets, and back.
 
     Inputs are ordered: the plain dimensions in the order of the observation, then sines, then cosines of the angles,
-    then the action. Targets are the non-constant dimensions in the order of the observation.
+    then the action. Targets are the non-constant dimensions in the order of the observation. Of a vector in
+    ``body_frame``, x is forwards and y to the left of the body in both, under the heading before the step.
 
     Args:
         observation_size: S.
@@ -26,12 +57,14 @@ class Encoder:
         spec: how to read the observation; indices must lie in [0, S).
 
     Raises:
-        ValueError: an index is out of range or repeated, or nothing is left to feed or to predict.
+        ValueError: an index is out of range or repeated, a vector's two numbers are not of one kind, or nothing is left
+            to feed or to predict.
     """
 
     def __init__(self, observation_size: int, action_size: int, spec: ObservationSpec | None = None):
         spec = spec or ObservationSpec()
         _check_indices(observation_size, spec)
+        _check_body_frame(observation_size, spec)
         fed = [i for i in range(observation_size) if i not in spec.not_inputs]
         self.observation_size, self.action_size, self.spec = observation_size, action_size, spec
         self.plain = [i for i in fed if i not in spec.angles]
@@ -45,10 +78,14 @@ class Encoder:
             raise ValueError(f"nothing is left to feed: there is no action, and not_inputs is everything in {spec}")
         self._is_change = torch.tensor([i not in spec.absolute for i in self.predicted])
         self._wraps = torch.tensor([i in spec.angles and i not in spec.absolute for i in self.predicted])
+        self.vectors = VectorColumns.of(spec.body_frame)
+        place = {index: column for column, index in enumerate(self.predicted)}
+        moving = [(heading, place[x], place[y]) for heading, x, y in spec.body_frame if x in place]
+        self._predicted_vectors = VectorColumns.of(moving)
 
     def inputs(self, observation: Float[Tensor, "*b S"], action: Float[Tensor, "*b A"]) -> Float[Tensor, "*b D"]:
         """The model's input, size D = plain dimensions + 2 x angles + A."""
-        parts = [observation[..., self.plain]]
+        parts = [self.vectors.turned(observation, observation, -1.0)[..., self.plain]]
         if self.angles:
             angle = observation[..., self.angles]
             parts += [angle.sin(), angle.cos()]
@@ -63,7 +100,7 @@ class Encoder:
         if bool(self._wraps.any()):
             turn = 2 * math.pi
             target = torch.where(self._wraps.to(after.device), target - turn * torch.round(target / turn), target)
-        return target
+        return self._predicted_vectors.turned(target, observation, -1.0)
 
     def next_observation(
         self, observation: Float[Tensor, "*b S"], target: Float[Tensor, "*b T"]
@@ -71,7 +108,8 @@ class Encoder:
         """Inverse of `targets` in its second argument, up to whole turns of an angle."""
         out = observation.clone()
         is_change = self._is_change.to(observation.device)
-        out[..., self.predicted] = target + torch.where(is_change, observation[..., self.predicted], 0.0)
+        along_axes = self._predicted_vectors.turned(target, observation, 1.0)
+        out[..., self.predicted] = along_axes + torch.where(is_change, observation[..., self.predicted], 0.0)
         return out
 
 
@@ -84,3 +122,25 @@ def _check_indices(observation_size: int, spec: ObservationSpec) -> None:
                 f"ObservationSpec.{name} must hold distinct indices from 0 to {observation_size - 1} "
                 f"(the observation has {observation_size} numbers), received {indices}"
             )
+
+
+def _check_body_frame(observation_size: int, spec: ObservationSpec) -> None:
+    what = "ObservationSpec.body_frame must hold triples (heading, x, y) of"
+    for frame in spec.body_frame:
+        if len(frame) != 3 or len(set(frame)) != 3 or not all(0 <= i < observation_size for i in frame):
+            raise ValueError(f"{what} distinct indices from 0 to {observation_size - 1}, received {frame}")
+    headings = {heading for heading, _, _ in spec.body_frame}
+    parts = [i for _, *vector in spec.body_frame for i in vector]
+    if len(set(parts)) != len(parts) or headings.intersection(parts):
+        raise ValueError(
+            f"{what} vectors that share no index with another or with a heading, received {spec.body_frame}"
+        )
+    for _, x, y in spec.body_frame:
+        for name in ("absolute", "not_inputs", "constant"):
+            if (x in getattr(spec, name)) != (y in getattr(spec, name)):
+                raise ValueError(
+                    f"a vector is turned as a whole: {x} and {y} must be both or neither in ObservationSpec.{name}, "
+                    f"received {getattr(spec, name)}"
+                )
+        if x in spec.angles or y in spec.angles:
+            raise ValueError(f"{x} and {y} are a vector, not angles: ObservationSpec.angles received {spec.angles}")

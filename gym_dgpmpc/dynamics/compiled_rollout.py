@@ -22,7 +22,7 @@ from gym_dgpmpc.gp.kernels import KERNELS, Kernel, argument_scale
 _Floats = ctypes.POINTER(ctypes.c_float)
 _Integers = ctypes.POINTER(ctypes.c_int64)
 
-AS_IS, SINE, COSINE, ACTION = range(4)
+AS_IS, SINE, COSINE, ACTION, FORWARDS, LEFTWARDS = range(6)
 
 
 class PathwiseLayer(NamedTuple):
@@ -72,6 +72,8 @@ class _Task(ctypes.Structure):
         ("shift", _Floats),
         ("spread", _Floats),
         ("target", _Integers),
+        ("num_vectors", ctypes.c_int64),
+        ("vectors", _Integers),
         ("layers", ctypes.POINTER(_Layer)),
         ("start", _Floats),
         ("actions", _Floats),
@@ -104,7 +106,10 @@ class CompiledRollout:
         encoder, first = coordinates.encoder, layers[0]
         self._kept: list[Tensor] = []  # the memory that the structures point into
         self._layers = (_Layer * len(layers))(*(self._packed(layer, units) for layer in layers))
-        inputs = [(AS_IS, i) for i in encoder.plain]
+        vectors = encoder.spec.body_frame
+        along_body = {x: (FORWARDS, k) for k, (_, x, _) in enumerate(vectors)}
+        along_body |= {y: (LEFTWARDS, k) for k, (_, _, y) in enumerate(vectors)}
+        inputs = [along_body.get(i, (AS_IS, i)) for i in encoder.plain]
         inputs += [(kind, i) for kind in (SINE, COSINE) for i in encoder.angles]
         inputs += [(ACTION, i) for i in range(encoder.action_size)]
         target = torch.full((encoder.observation_size,), -1)
@@ -130,6 +135,8 @@ class CompiledRollout:
             shift=self._floats(coordinates.shift),
             spread=self._floats(spread),
             target=self._integers(target),
+            num_vectors=len(vectors),
+            vectors=self._integers(torch.tensor(vectors)),
             layers=self._layers,
         )
 

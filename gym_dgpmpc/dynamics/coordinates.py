@@ -23,7 +23,8 @@ class Coordinates:
 
     Attributes:
         input_mean, input_scale: of the encoded inputs, [D].
-        carried, shift: the next state is carried * state + shift + what the targets add to it, [S] each.
+        carried, shift: the next state is carried * state + shift + what the targets add to it, [S] each; the latter two
+            along the body's axes where a vector is in ``body_frame``.
         spread: what one unit of each standardised target adds to its dimension of the state, [T].
     """
 
@@ -50,4 +51,5 @@ class Coordinates:
     def decode(self, observation: Float[Tensor, "P K S"], target: Float[Tensor, "P K T"]) -> Float[Tensor, "P K S"]:
         """The next observation from a standardised target."""
         kept = observation if self._all_carried else observation * self.carried
-        return (target @ self._spread).add_(self.shift).add_(kept)
+        added = (target @ self._spread).add_(self.shift)
+        return self.encoder.vectors.turned(added, observation, 1.0).add_(kept)

@@ -90,6 +90,11 @@ class SparseGPDynamics(Learner[_Fitted]):
         self.kernel: Kernel = check_kernel(kernel)
         if draw == "AMM" and self.kernel != "rbf":
             raise ValueError(f"the draw AMM has closed forms for the kernel 'rbf' only, received {kernel!r}")
+        if draw == "AMM" and observation_spec is not None and observation_spec.body_frame:
+            raise ValueError(
+                "the draw AMM has closed forms for sines and cosines, not for vectors that turn with a heading: "
+                f"received body_frame={observation_spec.body_frame}; take the draw MM"
+            )
         super().__init__(observation_size, action_size, observation_spec, dtype, device)
         self.num_inducing, self.exact, self.max_iterations = num_inducing, exact, max_iterations
         self.draw_kind, self.add_noise, self.update_within_episode = draw, add_noise, update_within_episode

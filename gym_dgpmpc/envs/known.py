@@ -44,7 +44,8 @@ class KnownTask(NamedTuple):
     """None: an episode never terminates. Where it does, the termination of every task here is known."""
     observation_spec: ObservationSpec
     planning_reward_fn: RewardFn | None = None
-    """What to plan with instead, where ``reward_fn`` tells too late, for a plan's horizon, that things go wrong."""
+    """What to plan with instead: where ``reward_fn`` tells too late, for a plan's horizon, that things go wrong, or
+    where the reward is nearly, but not quite, a function of the observations."""
 
 
 def find(env: gym.Env | EnvSpec) -> KnownTask | None:
@@ -135,46 +136,57 @@ def _pusher(env: Any) -> KnownTask:
 
 
 def _cheetah(env: Any) -> KnownTask:
-    return _runner(env, num_positions=1, pitch=1)
+    return _runner(env)
 
 
 def _swimmer(env: Any) -> KnownTask:
-    return _runner(env, num_positions=2, pitch=0)
+    """In the water all places and headings are alike: places and velocities are read along the first link.
+
+    Without the place, the velocities before and after a step tell the mean velocity in it well enough to plan with.
+    """
+    if not env._exclude_current_positions_from_observation:
+        spec = ObservationSpec(angles=(2,), not_inputs=(0, 1, 2), body_frame=((2, 0, 1), (2, 5, 6)))
+        return KnownTask(_forward_reward(env), None, spec)
+    reward = known.MeanVelocityReward(3, float(env._forward_reward_weight), float(env._ctrl_cost_weight))
+    spec = ObservationSpec(angles=(0,), not_inputs=(0,), body_frame=((0, 3, 4),))
+    return KnownTask(None, None, spec, reward)
 
 
 def _hopper(env: Any) -> KnownTask:
-    return _runner(env, num_positions=1, pitch=1, can_fall=True)
+    return _runner(env, can_fall=True)
 
 
 def _walker(env: Any) -> KnownTask:
-    return _runner(env, num_positions=1, pitch=1, can_fall=True)
+    return _runner(env, can_fall=True)
 
 
-def _runner(env: Any, num_positions: int, pitch: int, can_fall: bool = False) -> KnownTask:
-    """The tasks that reward the way forwards in a step.
+def _runner(env: Any, can_fall: bool = False) -> KnownTask:
+    """The tasks on legs that reward the way forwards in a step.
 
-    The reward is known if the observation begins with the ``num_positions`` places along the floor
-    (``exclude_current_positions_from_observation=False``), which then are predicted without being inputs, because it
-    does not matter where on the floor one is. The trunk's angle, ``pitch`` places after them, turns freely.
+    The reward is known if the observation begins with the place along the floor
+    (``exclude_current_positions_from_observation=False``), which then is predicted without being an input, because it
+    does not matter where on the floor one is. The trunk's angle, after its height, turns freely.
     """
     has_position = not env._exclude_current_positions_from_observation
-    first = num_positions if has_position else 0
+    first = 1 if has_position else 0
     unhealthy = None
     if can_fall:
         state_range = getattr(env, "_healthy_state_range", None)  # the hopper's
         unhealthy = known.Unhealthy(first, env._healthy_z_range, env._healthy_angle_range, state_range)
-    reward = None
-    if has_position:
-        reward = known.ForwardReward(
-            dt=float(env.dt),
-            forward_weight=float(env._forward_reward_weight),
-            ctrl_cost_weight=float(env._ctrl_cost_weight),
-            healthy_reward=0.0 if unhealthy is None else float(env._healthy_reward),
-            unhealthy=unhealthy,
-        )
+    reward = _forward_reward(env, unhealthy) if has_position else None
     ends = can_fall and env._terminate_when_unhealthy
-    spec = ObservationSpec(angles=(first + pitch,), not_inputs=tuple(range(first)))
+    spec = ObservationSpec(angles=(first + 1,), not_inputs=tuple(range(first)))
     return KnownTask(reward, unhealthy if ends else None, spec)
+
+
+def _forward_reward(env: Any, unhealthy: known.Unhealthy | None = None) -> known.ForwardReward:
+    return known.ForwardReward(
+        dt=float(env.dt),
+        forward_weight=float(env._forward_reward_weight),
+        ctrl_cost_weight=float(env._ctrl_cost_weight),
+        healthy_reward=0.0 if unhealthy is None else float(env._healthy_reward),
+        unhealthy=unhealthy,
+    )
 
 
 _TASKS: dict[str, Callable[[Any], KnownTask]] = {

@@ -106,6 +106,14 @@ def test_a_given_observation_spec_is_kept(tmp_path):
     assert DGPMPCAgent.load(tmp_path / "agent", KnownPointMass()).dynamics.encoder.spec == spec
 
 
+def test_an_observation_spec_with_vectors_survives_a_file(tmp_path):
+    settings = {**TINY, "learning_starts": 20}
+    learner = DGPMPCAgent("Swimmer-v5", **settings)
+    assert learner.observation_spec.body_frame == ((0, 3, 4),)
+    learner.save(tmp_path / "agent")
+    assert DGPMPCAgent.load(tmp_path / "agent").observation_spec == learner.observation_spec
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

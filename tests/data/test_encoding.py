@@ -67,7 +67,15 @@ def specs(draw):
     constant = subset()
     if len(constant) == size:
         constant = constant[1:]
-    return size, {"angles": subset(), "absolute": subset(), "not_inputs": subset(), "constant": constant}
+    fields = {"angles": subset(), "absolute": subset(), "not_inputs": subset(), "constant": constant}
+    if size >= 3 and draw(st.booleans()):
+        heading, x, y = draw(st.permutations(range(size)))[:3]
+        fields = {name: tuple(i for i in indices if i not in (x, y)) for name, indices in fields.items()}
+        for name in ("absolute", "not_inputs", "constant"):
+            something_is_left = name != "constant" or len(fields[name]) + 2 < size
+            fields[name] += (x, y) if draw(st.booleans()) and something_is_left else ()
+        fields["body_frame"] = ((heading, x, y),)
+    return size, fields
 
 
 @settings(max_examples=60, deadline=None)
@@ -98,6 +106,57 @@ def test_inputs_do_not_see_a_whole_turn_nor_what_is_not_fed():
     observation, action = normal(seeded(), 5, 4), normal(seeded(1), 5, 1)
     moved = observation + torch.tensor([0.0, 2 * math.pi, 0.0, 1.0], dtype=torch.float64)
     torch.testing.assert_close(encoder.inputs(moved, action), encoder.inputs(observation, action), rtol=0, atol=1e-14)
+
+
+def rigidly_turned(vectors, angle):
+    """Vectors "*b 2" turned anticlockwise, as complex numbers."""
+    turned = torch.view_as_complex(vectors.contiguous()) * torch.exp(1j * torch.as_tensor(angle))
+    return torch.view_as_real(turned)
+
+
+def test_turning_the_whole_world_changes_neither_inputs_nor_targets():
+    """The swimmer's layout with its places: they are no inputs, like the heading, but change along the body."""
+    encoder = Encoder(7, 2, ObservationSpec(angles=(2,), not_inputs=(0, 1, 2), body_frame=((2, 0, 1), (2, 4, 5))))
+    assert (encoder.input_size, encoder.target_size) == (4 + 2, 7)
+    observation, after, action = (normal(seeded(i), 20, n) for i, n in enumerate((7, 7, 2)))
+    turned = [state.clone() for state in (observation, after)]
+    for state in turned:
+        for first in (0, 4):
+            state[:, first : first + 2] = rigidly_turned(state[:, first : first + 2], 0.7)
+        state[:, 2] += 0.7
+    torch.testing.assert_close(encoder.inputs(turned[0], action), encoder.inputs(observation, action))
+    target = encoder.targets(observation, after)
+    torch.testing.assert_close(encoder.targets(*turned), target)
+    torch.testing.assert_close(encoder.next_observation(turned[0], target)[:, :2], turned[1][:, :2])
+
+
+def test_a_body_that_heads_north_moves_forwards_northwards():
+    encoder = Encoder(3, 0, ObservationSpec(not_inputs=(0,), body_frame=((0, 1, 2),)))
+    north = torch.tensor([math.pi / 2, 0.0, 2.0], dtype=torch.float64)
+    assert encoder.inputs(north, north[:0]).tolist() == pytest.approx([2.0, 0.0], abs=1e-15)
+    faster = north + torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64)
+    assert encoder.targets(north, faster).tolist() == pytest.approx([0.0, 0.5, 0.0], abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"body_frame": ((0, 1, 4),)}, r"triples .* from 0 to 3, received \(0, 1, 4\)"),
+        ({"body_frame": ((0, 1, 1),)}, r"distinct indices"),
+        ({"body_frame": ((0, 1, 2), (0, 2, 3))}, "share no index with another"),
+        ({"body_frame": ((0, 1, 2), (1, 0, 3))}, "share no index with another or with a heading"),
+        (
+            {"body_frame": ((0, 1, 2),), "absolute": (1,)},
+            r"1 and 2 must be both or neither .*absolute, received \(1,\)",
+        ),
+        ({"body_frame": ((0, 1, 2),), "constant": (2, 3)}, "both or neither .*constant"),
+        ({"body_frame": ((0, 1, 2),), "not_inputs": (2,)}, "both or neither .*not_inputs"),
+        ({"body_frame": ((0, 1, 2),), "angles": (2,)}, "1 and 2 are a vector, not angles"),
+    ],
+)
+def test_bad_vectors_are_named(fields, message):
+    with pytest.raises(ValueError, match=message):
+        Encoder(4, 1, ObservationSpec(**fields))
 
 
 @pytest.mark.parametrize("field", ["angles", "absolute", "not_inputs", "constant"])

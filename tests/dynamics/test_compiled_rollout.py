@@ -20,6 +20,9 @@ SPECS = [
     ObservationSpec(),
     ObservationSpec(angles=(1,)),
     ObservationSpec(angles=(1,), absolute=(0, 2), not_inputs=(0,), constant=(2,)),
+    ObservationSpec(angles=(1,), body_frame=((1, 2, 0),)),
+    ObservationSpec(absolute=(0, 2), not_inputs=(0, 1, 2), body_frame=((1, 0, 2),)),
+    ObservationSpec(constant=(0, 1), body_frame=((2, 0, 1),)),
 ]
 
 pytestmark = pytest.mark.skipif(not compiled_rollout.is_available(), reason="no C++ compiler works here")

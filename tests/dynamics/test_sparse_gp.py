@@ -6,7 +6,7 @@ import torch
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.sparse_gp import SparseGPDynamics
 from gym_dgpmpc.gp import exact
-from gym_dgpmpc.types import Transitions
+from gym_dgpmpc.types import ObservationSpec, Transitions
 from tests.oracles import pendulum
 from tests.oracles.models import normal, seeded
 
@@ -133,6 +133,10 @@ def test_later_trainings_start_from_the_last_one():
         ({"draw": "TS1"}, "unknown draw 'TS1': expected one of DS, MM, AMM"),
         ({"kernel": "cubic"}, "unknown kernel 'cubic'"),
         ({"kernel": "matern32", "draw": "AMM"}, "AMM has closed forms for the kernel 'rbf' only, received 'matern32'"),
+        (
+            {"observation_spec": ObservationSpec(body_frame=((0, 1, 2),)), "draw": "AMM"},
+            r"AMM has closed forms .* received body_frame=\(\(0, 1, 2\),\); take the draw MM",
+        ),
     ],
 )
 @pytest.mark.usefixtures("unchecked")

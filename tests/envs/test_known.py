@@ -153,6 +153,40 @@ def test_rewards_that_are_no_function_of_the_observation_are_left_open(env_id, a
     assert known.find(gymnasium.make(env_id, **arguments)).reward_fn is None
 
 
+@pytest.mark.parametrize("arguments", [{}, WEIGHTS])
+def test_the_swimmers_mean_velocity_is_nearly_that_of_the_observations(arguments):
+    env = gymnasium.make("Swimmer-v5", **arguments)
+    before, action, after, reward, *_ = rollouts(env)
+    error = known.find(env).planning_reward_fn(before, action, after).numpy() - reward
+    assert abs(error.mean()) < 0.005 * reward.std() and error.std() < 0.1 * reward.std()
+
+
+@pytest.mark.parametrize("arguments", [{}, POSITIONS])
+def test_a_swimmer_feels_neither_place_nor_heading(arguments):
+    """The simulator, started elsewhere under another heading, changes what the model predicts by rounding only."""
+    env = gymnasium.make("Swimmer-v5", **arguments)
+    encoder = Encoder(env.observation_space.shape[0], 2, known.find(env).observation_spec)
+    rng = np.random.default_rng(0)
+
+    def encoded(turn, place):
+        positions, velocities = np.array(start[:5]), np.array(start[5:])
+        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        positions[:2] = rotation @ positions[:2] + place
+        positions[2] += turn
+        velocities[:2] = rotation @ velocities[:2]
+        env.unwrapped.set_state(positions, velocities)
+        before = torch.as_tensor(env.unwrapped._get_obs())
+        after = torch.as_tensor(env.step(action)[0])
+        return encoder.inputs(before, torch.as_tensor(action).double()), encoder.targets(before, after)
+
+    env.reset(seed=0)
+    for _ in range(10):
+        start, action = rng.uniform(-1, 1, 10), rng.uniform(-1, 1, 2).astype(np.float32)
+        here, there = encoded(0.0, 0.0), encoded(rng.uniform(-3, 3), rng.uniform(-5, 5, 2))
+        for one, other in zip(here, there, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Swimmer-v5", "Hopper-v5", "Walker2d-v5"])
 def test_why_they_are_left_open(env_id):
     """The velocity at a step's end, which is observed, is not the mean velocity in it, which is rewarded."""

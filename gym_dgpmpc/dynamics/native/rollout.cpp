@@ -55,12 +55,15 @@ struct Task {
   int64_t num_functions;                               // T: H, or 1
   int64_t kernel;                                      // position in KERNELS
   float argument_scale;                                // c
-  const int64_t *input_kind;    // [D]: 0 the number itself, 1 its sine, 2 its cosine, 3 a number of the action
-  const int64_t *input_source;  // [D]: which number
+  const int64_t *input_kind;    // [D]: 0 the number itself, 1 its sine, 2 its cosine, 3 a number of the action,
+                                // 4, 5 the part of a vector forwards and to the left of the body
+  const int64_t *input_source;  // [D]: which number or vector
   const float *input_mean, *input_scale;               // [D]
   const float *carried, *shift;                        // [S]: s' = carried s + shift + spread out[target]
   const float *spread;                                 // [S]
   const int64_t *target;                               // [S]: which output, or -1
+  int64_t num_vectors;
+  const int64_t *vectors;       // [num_vectors, 3]: where heading, x and y are; what is added to x and y is along the body
   const Layer *layers;                                 // [L]
   const float *start;                                  // [S]
   const float *actions;                                // [K, H, A]
@@ -206,6 +209,14 @@ void evaluate(const Task &task, const Layer &layer, const float *kernel_out, con
   }
 }
 
+// The part of a vector (heading, x, y) forwards, or to the left, of the body.
+inline vec along_body(const int64_t *vector, const vec *state, int v, bool forwards) {
+  const vec turn = reduced(state[vector[0] * VECTORS + v]);
+  const vec cosine = cosine_of_reduced(turn), sine = sine_of_reduced(turn);
+  const vec x = state[vector[1] * VECTORS + v], y = state[vector[2] * VECTORS + v];
+  return forwards ? cosine * x + sine * y : cosine * y - sine * x;
+}
+
 // The standardised inputs [D, VECTORS] of POINTS points from their states [S, VECTORS] and actions.
 void encode(const Task &task, const vec *state, const float *actions, int64_t count, vec *input) {
   for (int64_t d = 0; d < task.input_size; d++) {
@@ -216,7 +227,7 @@ void encode(const Task &task, const vec *state, const float *actions, int64_t co
         for (int i = 0; i < LANES && v * LANES + i < count; i++)
           raw[i] = actions[(v * LANES + i) * task.horizon * task.action_size + source];
       } else {
-        raw = state[source * VECTORS + v];
+        raw = kind > 3 ? along_body(task.vectors + 3 * source, state, v, kind == 4) : state[source * VECTORS + v];
         if (kind == 1) raw = sine_of_reduced(reduced(raw));
         if (kind == 2) raw = cosine_of_reduced(reduced(raw));
       }
@@ -225,13 +236,37 @@ void encode(const Task &task, const vec *state, const float *actions, int64_t co
   }
 }
 
-void decode(const Task &task, const vec *out, vec *state) {
+// What the outputs add to dimension i of the state, its shift included.
+inline vec added(const Task &task, const vec *out, int64_t i, int v) {
+  const vec shift = all(task.shift[i]);
+  return task.target[i] < 0 ? shift : shift + out[task.target[i] * VECTORS + v] * task.spread[i];
+}
+
+// The next state [S, VECTORS], in place; `moved` [num_vectors, 2, VECTORS] is scratch.
+void decode(const Task &task, const vec *out, vec *state, vec *moved) {
+  // What is added to a vector turns by the heading before the step, so it is added while that is still in the state.
+  for (int64_t k = 0; k < task.num_vectors; k++) {
+    const int64_t *vector = task.vectors + 3 * k;
+    for (int v = 0; v < VECTORS; v++) {
+      const vec turn = reduced(state[vector[0] * VECTORS + v]);
+      const vec cosine = cosine_of_reduced(turn), sine = sine_of_reduced(turn);
+      const vec forwards = added(task, out, vector[1], v), left = added(task, out, vector[2], v);
+      const vec x = state[vector[1] * VECTORS + v] * task.carried[vector[1]];
+      const vec y = state[vector[2] * VECTORS + v] * task.carried[vector[2]];
+      moved[2 * k * VECTORS + v] = x + (cosine * forwards - sine * left);
+      moved[(2 * k + 1) * VECTORS + v] = y + (sine * forwards + cosine * left);
+    }
+  }
   for (int64_t i = 0; i < task.observation_size; i++)
     for (int v = 0; v < VECTORS; v++) {
       vec &s = state[i * VECTORS + v];
       s = s * task.carried[i] + task.shift[i];
       if (task.target[i] >= 0) s += out[task.target[i] * VECTORS + v] * task.spread[i];
     }
+  for (int64_t k = 0; k < task.num_vectors; k++)
+    for (int part = 0; part < 2; part++)
+      for (int v = 0; v < VECTORS; v++)
+        state[task.vectors[3 * k + 1 + part] * VECTORS + v] = moved[(2 * k + part) * VECTORS + v];
 }
 
 // Transpose the first `count` of POINTS states from [S, VECTORS] to rows of S.
@@ -248,7 +283,8 @@ void run(const Task &task, int64_t particle, int64_t first, int64_t last, vec *s
   vec *states = scratch;                                      // [blocks, S, VECTORS]
   vec *input = states + blocks * size * VECTORS;              // [D, VECTORS]
   vec *scaled = input + inputs * VECTORS;                     // [D, VECTORS]
-  vec *out = scaled + inputs * VECTORS;                       // [max(D, S), VECTORS]
+  vec *moved = scaled + inputs * VECTORS;                     // [num_vectors, 2, VECTORS]
+  vec *out = moved + 2 * task.num_vectors * VECTORS;          // [max(D, S), VECTORS]
   const int64_t row = task.num_particles * task.num_candidates * size;
   for (int64_t b = 0; b < blocks; b++) {
     for (int64_t s = 0; s < size; s++)
@@ -274,7 +310,7 @@ void run(const Task &task, int64_t particle, int64_t first, int64_t last, vec *s
         if (l + 1 < task.num_layers)
           for (int64_t i = 0; i < inputs * VECTORS; i++) input[i] += out[i];
       }
-      decode(task, out, state);
+      decode(task, out, state, moved);
     }
   }
 }
@@ -291,9 +327,9 @@ int64_t points() { return POINTS; }
 int64_t rollout(const Task *task, int64_t particle, int64_t first, int64_t last) {
   const int64_t blocks = (last - first + POINTS - 1) / POINTS;
   const int64_t widest = task->input_size > task->observation_size ? task->input_size : task->observation_size;
-  const int64_t vectors = (blocks * task->observation_size + 2 * task->input_size + widest) * VECTORS;
+  const int64_t rows = blocks * task->observation_size + 2 * task->input_size + 2 * task->num_vectors + widest;
   void *memory = nullptr;
-  if (posix_memalign(&memory, sizeof(vec), vectors * sizeof(vec))) return 1;
+  if (posix_memalign(&memory, sizeof(vec), rows * VECTORS * sizeof(vec))) return 1;
   vec *scratch = (vec *)memory;
   switch (task->kernel) {
     case RBF: run<RBF>(*task, particle, first, last, scratch); break;
