@@ -67,14 +67,15 @@ class ModelledVector:
     def spec(self) -> ObservationSpec:
         """How to read the vector: what was added is predicted as it is, and no input.
 
-        The headings of vectors are inputs then, for a reward may depend on them where the dynamics do not.
+        What is constant, such as a goal, and the headings of vectors are inputs then even if the dynamics do not depend
+        on them, because what was added may.
         """
         added = tuple(range(self.observation_size, self.size))
         spec = self.observation_spec
         if not added:
             return spec
-        headings = {heading for heading, _, _ in spec.body_frame}
-        not_inputs = (*(i for i in spec.not_inputs if i not in headings), *added)
+        let_in = {heading for heading, _, _ in spec.body_frame} | set(spec.constant)
+        not_inputs = (*(i for i in spec.not_inputs if i not in let_in), *added)
         return replace(spec, absolute=(*spec.absolute, *added), not_inputs=not_inputs)
 
     def transitions(self, store: TransitionStore) -> Transitions:

@@ -140,6 +140,11 @@ def test_the_goal_is_constant_and_nothing_feels_it():
     assert find_observation_spec(wrapped_env(Goal()), None) == ObservationSpec(constant=(1,), not_inputs=(1,))
 
 
+def test_a_learned_reward_is_fed_the_goal():
+    learner = DGPMPCAgent(Goal(), reward_fn="learned", **TINY)
+    assert 1 in learner.dynamics.encoder.plain and 1 not in learner.dynamics.encoder.predicted
+
+
 def test_sparse_rewards_warn():
     with pytest.warns(UserWarning, match="sparse rewards, in which a planner has nothing to climb"):
         agent(Goal("sparse"))

@@ -71,10 +71,11 @@ class TestVector:
         assert spec == ObservationSpec(angles=(1,), absolute=(0, 3, 4), not_inputs=(0, 3, 4), constant=(2,))
         assert ModelledVector(3, self.spec).spec == self.spec
 
-    def test_a_learned_reward_may_depend_on_the_heading(self):
-        own = ObservationSpec(not_inputs=(0, 3), body_frame=((0, 1, 2),))
-        assert ModelledVector(4, own, reward=True).spec.not_inputs == (3, 4)
-        assert ModelledVector(4, own).spec.not_inputs == (0, 3)
+    def test_what_is_learned_may_depend_on_a_goal_or_on_the_heading(self):
+        own = ObservationSpec(not_inputs=(0, 3, 4), constant=(4,), body_frame=((0, 1, 2),))
+        assert ModelledVector(5, own, reward=True).spec.not_inputs == (3, 5)
+        assert ModelledVector(5, own, terminated=True).spec.not_inputs == (3, 5)
+        assert ModelledVector(5, own).spec.not_inputs == (0, 3, 4)
 
     def test_what_is_known_goes_before_what_is_predicted(self):
         after = torch.tensor([[0.0, 0.0, 1.3, 7.0, 0.6], [2.0, 0.0, 0.0, 8.0, 0.4]])
