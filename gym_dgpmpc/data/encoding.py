@@ -32,7 +32,7 @@ class VectorColumns(NamedTuple):
     def turned(
         self, values: Float[Tensor, "*b n"], observation: Float[Tensor, "*b S"], sense: float
     ) -> Float[Tensor, "*b n"]:
-        """The values, each vector turned by its heading, from the body's axes to the fixed ones (-1: back)."""
+        """The values, each vector turned by ``sense`` times its heading: 1 from the body to fixed axes, -1 back."""
         if not self.headings:
             return values
         angle = observation[..., self.headings]
