@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from gym_dgpmpc.bench.markdown import cell, table
+from gym_dgpmpc.bench.markdown import NOTHING, cell, table
 from gym_dgpmpc.bench.results import RunResult
 from gym_dgpmpc.bench.scores import Runs
 
@@ -45,21 +45,24 @@ class Origins:
 
     def lines(self) -> list[str]:
         """The section that says what each letter stands for."""
+        shared = set.intersection(*(set(origin.versions) | set(origin.machine) for origin in self._runs))
         rows = []
         for origin, results in self._runs.items():
-            started = sorted(result.started[:10] for result in results)
+            started = sorted({result.started[:10] for result in results})
             rows.append([
                 self._letters[origin], str(len(results)), _commands(results), f"`{cell(origin.revision)}`",
-                _pairs(origin.versions), _pairs(origin.machine), f"{started[0]} to {started[-1]}",
+                _pairs(pair for pair in (*origin.versions, *origin.machine) if pair not in shared) or NOTHING,
+                " to ".join(dict.fromkeys((started[0], started[-1]))),
             ])  # fmt: skip
         differing = _differing(list(self._letters))
         return [
             f"## {SECTION}",
             "",
             f"Not the same in all runs: {differing}." if differing else "All runs have the same revision and versions.",
+            *([f"The same in all: {_pairs(sorted(shared))}."] if shared else []),
             "Each run's own command, with its seed and all its settings, is in its file.",
             "",
-            *table(["", "runs", "commands", "revision", "versions", "machine", "started"], rows),
+            *table(["", "runs", "commands", "revision", "other versions or machine", "started"], rows),
         ]
 
 
@@ -71,12 +74,13 @@ def _commands(results: Sequence[RunResult]) -> str:
 
 
 def _seeds(runs: Runs) -> str:
-    """ "Seeds 0, 1, 2." or, where methods have others, "Seeds 0, 1, 2; PETS TS1: 0, 1." """
-    by_method = {method: ", ".join(str(r.key.seed) for r in results) for method, results in runs.items()}
-    texts = list(by_method.values())
-    usual = max(texts, key=texts.count)
-    others = "; ".join(f"{method}: {text}" for method, text in by_method.items() if text != usual)
-    return f"Seeds {usual}" + (f"; {others}" if others else "") + "."
+    """ "Seeds 0, 1, 2." or, where methods have others, "Seeds 0, 1, 2 (of GP-MM, GP-DS: 0; of PETS TS1: 0, 1)." """
+    methods: dict[str, list[str]] = {}
+    for method, results in runs.items():
+        methods.setdefault(", ".join(str(result.key.seed) for result in results), []).append(method)
+    usual = max(methods, key=lambda seeds: len(methods[seeds]))
+    others = "; ".join(f"of {', '.join(named)}: {seeds}" for seeds, named in methods.items() if seeds != usual)
+    return f"Seeds {usual}" + (f" ({others})" if others else "") + "."
 
 
 def _differing(origins: list[Origin]) -> str:

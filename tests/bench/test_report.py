@@ -67,14 +67,13 @@ def test_every_table_and_figure_says_what_it_was_made_from(folder, tmp_path):
     captions = re.findall(r"Seeds .* Made with \[[A-Z, ]+\]\(#what-the-runs-were-made-with\)\.", body)
     assert len(captions) == len(blocks) > 10
     assert "Not the same in all runs: revisions." in origins
-    assert re.search(
-        r"^\| A \| 11 \| `dgpmpc bench some …` \(11\) \| `abc` \| numpy 2.0, python 3.11 \| cores 2 \|", origins, re.M
-    )
-    assert re.search(r"^\| B \| 2 \| `dgpmpc bench some …` \(2\) \| `def` \|", origins, re.M)
+    assert "The same in all: cores 2, numpy 2.0, python 3.11." in origins
+    assert re.search(r"^\| A \| 11 \| `dgpmpc bench some …` \(11\) \| `abc` \| – \|", origins, re.M)
+    assert re.search(r"^\| B \| 2 \| `dgpmpc bench some …` \(2\) \| `def` \| – \|", origins, re.M)
     cart_pole, alone = body.index("## ModCartPole-v0"), body.index("## Alone-v0")
     assert "**Their revisions or versions differ.**" in body[cart_pole:alone]
     assert "**Their" not in body[alone:]
-    assert "Seeds 0, 1; true dynamics: 0." in body[alone:]
+    assert "Seeds 0, 1 (of true dynamics: 0)." in body[alone:]
 
 
 def test_differing_versions_are_named():
@@ -83,9 +82,19 @@ def test_differing_versions_are_named():
     )  # fmt: skip
     origins = Origins(study)
     assert "Not the same in all runs: numpy (2.0, 2.1), torch (2.3, none)." in origins.lines()
+    assert "The same in all: cores 2." in origins.lines()
+    assert [line.split(" | ")[4] for line in origins.lines() if re.match(r"\| [AB] ", line)] == [
+        "numpy 2.0, torch 2.3", "numpy 2.1",
+    ]  # fmt: skip
     assert origins.caption(study["Pendulum-v1"]).endswith("**Their revisions or versions differ.**")
     alike = Origins(grouped(run("A", [1.0]), run("B", [1.0])))
     assert "All runs have the same revision and versions." in alike.lines()
+
+
+def test_methods_with_the_same_other_seeds_are_told_together():
+    runs = {name: [run(name, [1.0], seed=seed) for seed in seeds]
+            for name, seeds in {"A": [0, 1], "B": [0], "C": [0, 1], "D": [2], "E": [0]}.items()}  # fmt: skip
+    assert Origins({"Pendulum-v1": runs}).caption(runs).startswith("Seeds 0, 1 (of B, E: 0; of D: 2). Made with")
 
 
 def test_a_command_cannot_break_the_table():
