@@ -35,12 +35,12 @@ class Origins:
                 self._runs.setdefault(Origin.of(result), []).append(result)
         self._letters = {origin: _letters(place) for place, origin in enumerate(self._runs)}
 
-    def caption(self, runs: Runs) -> str:
+    def caption(self, study: Mapping[str, Runs]) -> str:
         """Seeds and origins of the runs behind a table or figure, and whether their revisions or versions differ."""
-        met = {Origin.of(result) for result in itertools.chain(*runs.values())}
+        met = {Origin.of(result) for runs in study.values() for result in itertools.chain(*runs.values())}
         origins = [origin for origin in self._letters if origin in met]
         letters = ", ".join(self._letters[origin] for origin in origins)
-        text = f"{_seeds(runs)} Made with [{letters}](#{SECTION.lower().replace(' ', '-')})."
+        text = f"{_seeds(study)} Made with [{letters}](#{SECTION.lower().replace(' ', '-')})."
         return text + (" **Their revisions or versions differ.**" if _differing(origins) else "")
 
     def lines(self) -> list[str]:
@@ -73,14 +73,26 @@ def _commands(results: Sequence[RunResult]) -> str:
     return ", ".join(f"`{cell(head)}{' …' if head in options else ''}` ({count})" for head, count in heads.items())
 
 
-def _seeds(runs: Runs) -> str:
-    """ "Seeds 0, 1, 2." or, where methods have others, "Seeds 0, 1, 2 (of GP-MM, GP-DS: 0; of PETS TS1: 0, 1)." """
+def _seeds(study: Mapping[str, Runs]) -> str:
+    """ "Seeds 0, 1, 2.", and where methods have others, "Seeds 0, 1, 2 (of GP-MM, GP-DS: 0; of PETS TS1: 0, 1)."
+
+    Of several tasks, those whose methods have the same seeds are told together: "Seeds 0 on A, B; 0, 1 on C."
+    """
+    tasks: dict[str, list[str]] = {}
+    for task, runs in study.items():
+        tasks.setdefault(_seeds_of_task(runs), []).append(task)
+    if len(tasks) == 1:
+        return f"Seeds {next(iter(tasks))}."
+    return "Seeds " + "; ".join(f"{seeds} on {', '.join(named)}" for seeds, named in tasks.items()) + "."
+
+
+def _seeds_of_task(runs: Runs) -> str:
     methods: dict[str, list[str]] = {}
     for method, results in runs.items():
         methods.setdefault(", ".join(str(result.key.seed) for result in results), []).append(method)
     usual = max(methods, key=lambda seeds: len(methods[seeds]))
     others = "; ".join(f"of {', '.join(named)}: {seeds}" for seeds, named in methods.items() if seeds != usual)
-    return f"Seeds {usual}" + (f" ({others})" if others else "") + "."
+    return usual + (f" ({others})" if others else "")
 
 
 def _differing(origins: list[Origin]) -> str:

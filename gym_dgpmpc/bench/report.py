@@ -33,11 +33,11 @@ class _Page:
     def add(self, *lines: str) -> None:
         self.lines += [*lines, ""]
 
-    def table(self, table: Sequence[str], runs: Runs, caption: str) -> None:
+    def table(self, table: Sequence[str], study: Mapping[str, Runs], caption: str) -> None:
         """A table with what it shows and where its runs come from; nothing if it is empty."""
         if table:
             self.add(*table)
-            self.add(f"{caption} {self._origins.caption(runs)}")
+            self.add(f"{caption} {self._origins.caption(study)}")
 
     def place(self, name: str) -> Path:
         """Where the next figure is to be written."""
@@ -45,10 +45,10 @@ class _Page:
         self.figures.append(path)
         return path
 
-    def show(self, what: str, runs: Runs, caption: str) -> None:
+    def show(self, what: str, study: Mapping[str, Runs], caption: str) -> None:
         """Refer to the figure that was written last."""
         self.add(f"![{what}]({self._folder.name}/{self.figures[-1].name})")
-        self.add(f"{caption} {self._origins.caption(runs)}")
+        self.add(f"{caption} {self._origins.caption(study)}")
 
 
 def write_report(
@@ -109,7 +109,7 @@ def _add_overview(page: _Page, study: Mapping[str, Runs], references: Mapping[st
     drawn = {task: scores.compared(runs, references.get(task)) for task, runs in study.items()}
     drawn = {task: methods for task, methods in drawn.items() if len(methods) > 1}
     if drawn:
-        of = _all_runs({task: {m: study[task][m] for m in methods} for task, methods in drawn.items()})
+        of = {task: {method: study[task][method] for method in methods} for task, methods in drawn.items()}
         page.add("## All methods")
         charts.plot_tasks(drawn, study, references, page.place("comparison"), "return")
         page.show("Return of each method on each task", of, _curve_caption("Return of an episode"))
@@ -141,7 +141,7 @@ def _add_overview(page: _Page, study: Mapping[str, Runs], references: Mapping[st
     if lines:
         page.add("## The paper's table")
         page.table(
-            lines, _all_runs(own),
+            lines, own,
             "Average return over a run's first "
             + ", ".join(f"{paper.EPISODES[task]} ({task})" for task in own)
             + f" episodes, then mean and standard deviation over seeds; the paper has {paper.TRIALS} trials.",
@@ -150,22 +150,23 @@ def _add_overview(page: _Page, study: Mapping[str, Runs], references: Mapping[st
 
 def _add_task(page: _Page, task: str, runs: Runs, reference: str | None, thresholds: Mapping[str, float]) -> None:
     page.add(f"## {task}")
+    of = {task: runs}
     methods = scores.compared(runs, reference)
     if len(methods) < 2:  # no other method: the package's own settings against each other
         methods = [method for method in runs if method != CEILING]
     if methods:
         charts.plot_clocks(methods, task, runs, reference, page.place(f"{task}_learning"))
-        page.show(f"Learning curves on {task}", runs, _curve_caption("Return of an episode"))
+        page.show(f"Learning curves on {task}", of, _curve_caption("Return of an episode"))
     settings = [method for method in runs if scores.setting_of(method)]
     if len(settings) > 1:
         charts.plot_settings(task, runs, page.place(f"{task}_settings"))
         page.show(
-            f"Depths and kernels on {task}", {method: runs[method] for method in settings},
+            f"Depths and kernels on {task}", {task: {method: runs[method] for method in settings}},
             "Return of an episode with every depth and kernel: single runs thin, their mean thick.",
         )  # fmt: skip
     steps = scores.common_steps(runs)
     page.table(
-        tables.comparison_table(runs), runs,
+        tables.comparison_table(runs), of,
         f"Each run's average return over the episodes that ended within {steps:,} environment steps, as many as "
         "all runs have.",
     )  # fmt: skip
@@ -173,21 +174,21 @@ def _add_task(page: _Page, task: str, runs: Runs, reference: str | None, thresho
     if without:
         page.add(f"Not in the table, for a run without an episode by then: {', '.join(without)}.")
     page.table(
-        tables.improvement_table(runs, reference), runs,
+        tables.improvement_table(runs, reference), of,
         "Probability that a run of the first has a higher mean return than a run of Y within these steps (0.5: as "
         "often as not), and the two-sided Mann-Whitney test's p, which for 3 runs against 3 cannot be less than 0.1.",
     )  # fmt: skip
-    page.table(tables.end_table(runs), runs, "How the runs ended, each at its own length.")
+    page.table(tables.end_table(runs), of, "How the runs ended, each at its own length.")
     threshold = scores.threshold_of(task, runs, thresholds)
     if threshold is not None and methods:
         page.table(
-            tables.threshold_table(runs, threshold), runs,
+            tables.threshold_table(runs, threshold), of,
             f"Environment steps until an episode's return first reached {tables.number(threshold.value)} "
             f"({threshold.origin}). A run that never did is censored at its end.",
         )  # fmt: skip
-    page.table(tables.success_table(runs), runs, f"Share of successful episodes within {steps:,} environment steps.")
+    page.table(tables.success_table(runs), of, f"Share of successful episodes within {steps:,} environment steps.")
     page.table(
-        tables.time_table(runs), runs,
+        tables.time_table(runs), of,
         "Wall-clock time with everything that a run does, and of choosing one action; runs may share a machine.",
     )  # fmt: skip
 
@@ -197,12 +198,3 @@ def _curve_caption(what: str) -> str:
         f"{what}: mean over seeds, with its bootstrap interval. A curve ends where the shortest of its runs does; runs "
         f"of more than {MOST_POINTS} episodes are smoothed."
     )
-
-
-def _all_runs(study: Mapping[str, Runs]) -> dict[str, list]:
-    """The runs of several tasks as one, methods named with their task where there is more than one task."""
-    merged: dict[str, list] = {}
-    for task, runs in study.items():
-        for method, results in runs.items():
-            merged[f"{method} on {task}" if len(study) > 1 else method] = list(results)
-    return merged

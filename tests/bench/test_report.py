@@ -86,7 +86,7 @@ def test_differing_versions_are_named():
     assert [line.split(" | ")[4] for line in origins.lines() if re.match(r"\| [AB] ", line)] == [
         "numpy 2.0, torch 2.3", "numpy 2.1",
     ]  # fmt: skip
-    assert origins.caption(study["Pendulum-v1"]).endswith("**Their revisions or versions differ.**")
+    assert origins.caption(study).endswith("**Their revisions or versions differ.**")
     alike = Origins(grouped(run("A", [1.0]), run("B", [1.0])))
     assert "All runs have the same revision and versions." in alike.lines()
 
@@ -94,7 +94,11 @@ def test_differing_versions_are_named():
 def test_methods_with_the_same_other_seeds_are_told_together():
     runs = {name: [run(name, [1.0], seed=seed) for seed in seeds]
             for name, seeds in {"A": [0, 1], "B": [0], "C": [0, 1], "D": [2], "E": [0]}.items()}  # fmt: skip
-    assert Origins({"Pendulum-v1": runs}).caption(runs).startswith("Seeds 0, 1 (of B, E: 0; of D: 2). Made with")
+    study = {"Pendulum-v1": runs}
+    assert Origins(study).caption(study).startswith("Seeds 0, 1 (of B, E: 0; of D: 2). Made with")
+    study |= {"Swimmer-v5": {"A": runs["A"]}, "Ant-v5": runs}
+    told = "Seeds 0, 1 (of B, E: 0; of D: 2) on Pendulum-v1, Ant-v5; 0, 1 on Swimmer-v5. Made with"
+    assert Origins(study).caption(study).startswith(told)
 
 
 def test_a_command_cannot_break_the_table():
