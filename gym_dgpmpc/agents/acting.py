@@ -43,7 +43,9 @@ class ActingAgent(PlanningAgent):
         if self.is_fitted:
             return False
         if self.learning_starts is None:
-            return not all(running.has_explored for running in self._running)
+            # An episode that never ends must not put off the first training beyond the others.
+            enough = self.train_freq is not None and len(self.store) >= self.train_freq
+            return not enough and not all(running.has_explored for running in self._running)
         return len(self.store) < self.learning_starts
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -63,7 +65,8 @@ class ActingAgent(PlanningAgent):
         Args:
             data: an SB3 `ReplayBuffer` or `DictReplayBuffer`, a Minari dataset, or a mapping of arrays, steps first:
                 "observation" [n, S], "action" [n, A], "next_observation" [n, S], "reward" [n] and "terminated" [n]
-                (if it is left out, none was). Dict observations are dicts of such.
+                (if it is left out, none was). Dict observations are dicts of such. Of a buffer with
+                ``optimize_memory_usage`` the last steps of episodes are left out: it does not keep what they led to.
             scaled_actions: whether actions are given in [-1, 1] whatever the action space, as SB3's algorithms keep
                 them in their buffers. None: so it is in a `ReplayBuffer`, and in nothing else.
 
@@ -142,8 +145,8 @@ class ActingAgent(PlanningAgent):
         episodes = np.array([running.index for running in self._running])
         self.store.extend(observations, actions, after, reward=rewards, terminated=terminated, episode=episodes)
         self.num_timesteps += len(self._running)
-        for running, reward in zip(self._running, rewards, strict=True):
-            running.record.add_reward(float(reward))
+        for running, reward, ended in zip(self._running, rewards, terminated, strict=True):
+            running.record.add_reward(float(reward), terminated=bool(ended))
 
     def _keep_last_step(self, observations: np.ndarray, actions: np.ndarray) -> None:
         """Store the step that ended an episode, where it is the reset after it that failed."""

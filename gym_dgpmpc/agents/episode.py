@@ -26,6 +26,7 @@ class EpisodeRecord:
         self.plan_seconds: list[float] = []
         self.num_late = 0
         """Plans that took longer than their time budget."""
+        self.has_terminated = False
 
     def add_plan(self, info: PlanInfo, seconds: float, *, late: bool = False) -> None:
         """A plan made before the step whose reward is added next."""
@@ -34,8 +35,10 @@ class EpisodeRecord:
         self.plan_seconds.append(seconds)
         self.num_late += late
 
-    def add_reward(self, reward: float) -> None:
+    def add_reward(self, reward: float, *, terminated: bool = False) -> None:
+        """The reward of a step, and whether the step ended the episode by termination."""
         self.rewards.append(reward)
+        self.has_terminated |= terminated
 
     @property
     def episode_return(self) -> float:
@@ -45,11 +48,13 @@ class EpisodeRecord:
         """Reward per step: what the plans expected over their horizons, and what was obtained over the same steps.
 
         The two are averages over the same plans, so they agree for a perfect model whose plans are carried out; a
-        planner that exploits its model's errors predicts more than it obtains. Steps beyond the episode's end are
-        left out of what was obtained.
+        planner that exploits its model's errors predicts more than it obtains. Steps that a plan has beyond the
+        episode's end count as zero if it ended by termination, as they do in the plan; otherwise they are left out of
+        what was obtained.
         """
         predicted = [info.expected_return / self.horizon for info in self.plans]
-        obtained = [np.mean(self.rewards[step : step + self.horizon]) for step in self.plan_steps]
+        over = [self.rewards[step : step + self.horizon] for step in self.plan_steps]
+        obtained = [np.sum(rewards) / (self.horizon if self.has_terminated else len(rewards)) for rewards in over]
         known = np.isfinite(predicted)  # a plan without time for one iteration expected nothing
         if not known.any():
             return float("nan"), float("nan")
@@ -94,6 +99,7 @@ class EpisodeRecord:
             "plan_steps": torch.tensor(self.plan_steps, dtype=torch.int64),
             "plan_seconds": torch.tensor(self.plan_seconds, dtype=torch.float64),
             "num_late": torch.tensor(self.num_late),
+            "has_terminated": torch.tensor(self.has_terminated),
             "seconds": torch.tensor(time.perf_counter() - self.started, dtype=torch.float64),
         }
 
@@ -112,4 +118,5 @@ class EpisodeRecord:
         self.plan_steps = [int(step) for step in state["plan_steps"].tolist()]
         self.plan_seconds = state["plan_seconds"].tolist()
         self.num_late = int(state["num_late"])
+        self.has_terminated = bool(state.get("has_terminated", False))  # files of version 0.1.0 do not say
         self.started = time.perf_counter() - float(state["seconds"])

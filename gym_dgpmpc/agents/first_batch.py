@@ -11,8 +11,9 @@ from torch import Tensor
 REWARD_SIGNATURE = "reward_fn(observation [*b, S], action [*b, A], next_observation [*b, S]) -> reward [*b]"
 TERMINATED_SIGNATURE = "terminated_fn(next_observation [*b, S]) -> terminated [*b], bool"
 
-SHAPE = (3, 2)
-"""Of the batch, which has two dimensions because the planner's has three: one alone would hide a fixed axis."""
+HORIZON, PARTICLES = 4, 3
+"""Of the batch [H, P, K] that a function is tried on, the planner's shape; candidates are one more than numbers in an
+observation, so that no axis passes for another one."""
 WIDEST = 1e6
 """Bounds further apart than this are no statement about what values occur."""
 
@@ -72,21 +73,27 @@ def check_termination(
 def example_batch(
     observation_space: spaces.Box, action_space: spaces.Box, device: torch.device | str = "cpu"
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Batches [3, 2] of observations, actions and next observations, float32.
+    """Batches [H, P, K] of observations, actions and next observations, float32.
 
-    Uniform between bounds; where there are none, or so wide ones that they say nothing, normal about the place nearest
-    to zero that is allowed. The spaces' own random numbers are not advanced.
+    As in a plan, one action of a candidate is that of all particles, and the next observations are the observations of
+    a step later, in the same memory. Uniform between bounds; where there are none, or so wide ones that they say
+    nothing, normal about the place nearest to zero that is allowed. The spaces' own random numbers are not advanced.
     """
     generator = np.random.default_rng(0)
-    both = (observation_space, action_space, observation_space)
-    drawn = [_sample(space, generator).astype(np.float32) for space in both]
-    observation, action, after = (torch.as_tensor(each, device=device).reshape(*SHAPE, -1) for each in drawn)
-    return observation, action, after
+    candidates = observation_space.low.size + 1
+    states, actions = (
+        torch.as_tensor(each, dtype=torch.float32, device=device)
+        for each in (
+            _sample(observation_space, (HORIZON + 1, PARTICLES, candidates), generator),
+            _sample(action_space, (HORIZON, 1, candidates), generator),
+        )
+    )
+    return states[:-1], actions.expand(-1, PARTICLES, -1, -1), states[1:]
 
 
-def _sample(space: spaces.Box, generator: np.random.Generator) -> np.ndarray:
+def _sample(space: spaces.Box, batch: tuple[int, ...], generator: np.random.Generator) -> np.ndarray:
     low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
-    shape = (int(np.prod(SHAPE)), low.size)
+    shape = (*batch, low.size)
     with np.errstate(over="ignore"):
         bounded = high - low < WIDEST
     uniform = np.where(bounded, low, 0.0) + np.where(bounded, high - low, 1.0) * generator.random(shape)
@@ -101,17 +108,20 @@ def _tried(
     if not callable(function):
         raise TypeError(f"{name} must be a function {signature}, got {function!r}")
     shapes = ", ".join(str(list(tensor.shape)) for tensor in batch)
-    kind = "bool" if is_bool else "float"
-    expected = f"{name} must map tensors of shapes {shapes} to a {kind} tensor {list(SHAPE)}; its signature is "
+    shape, kind = batch[0].shape[:-1], "bool" if is_bool else "float"
+    expected = f"{name} must map tensors of shapes {shapes} to a {kind} tensor {list(shape)}; its signature is "
     expected += signature
+    before = [tensor.clone() for tensor in batch]
     try:
         value = function(*batch)
     except Exception as error:
         raise ValueError(f"{expected}. It raised {type(error).__name__}: {error}") from error
+    if not all(map(torch.equal, batch, before)):
+        raise ValueError(f"{expected}. It changed the tensors that it was given: work on a copy")
     if not isinstance(value, Tensor):
         raise TypeError(f"{expected}. It returned {type(value).__name__}")
     right_kind = value.dtype == torch.bool if is_bool else value.is_floating_point()
-    if value.shape != SHAPE or not right_kind:
+    if value.shape != shape or not right_kind:
         raise ValueError(f"{expected}. It returned {value.dtype} of shape {list(value.shape)}")
     if value.device != batch[0].device:
         raise ValueError(

@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.agents.parts import cem_planner
-from gym_dgpmpc.agents.task import Learned
+from gym_dgpmpc.agents.task import LEARNED, Learned, flat_size
 from gym_dgpmpc.dynamics.sparse_gp import GPDraw, SparseGPDynamics
 from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
 
@@ -143,10 +143,16 @@ class GPMPCAgent(MPCAgent):
     def _make_dynamics(
         self, observation_size: int, action_size: int, observation_spec: ObservationSpec
     ) -> SparseGPDynamics:
-        if self.draw == "AMM" and self.num_particles <= observation_size:
+        largest = observation_size
+        if self._task is not None:
+            # Termination is learned from the first one on, in the middle of a run: too late to say this then.
+            learned = (self._task.reward_fn is None) + (self._task.terminated_source == LEARNED)
+            largest = max(largest, flat_size(self.observation_space) + learned)
+        if self.draw == "AMM" and self.num_particles <= largest:
             raise ValueError(
-                f"the draw AMM needs more particles than the {observation_size} numbers of an observation (and of what "
-                f"else is learned), got num_particles = {self.num_particles}"
+                f"the draw AMM needs more particles than the {largest} numbers of an observation and of what else "
+                "is or may be learned (the reward and, unless terminated_fn says when episodes end, termination), got "
+                f"num_particles = {self.num_particles}"
             )
         return SparseGPDynamics(
             observation_size,

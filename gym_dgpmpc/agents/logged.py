@@ -118,13 +118,18 @@ def _of_episodes(data: EpisodeDataset) -> LoggedRows:
 
 
 def _of_buffer(buffer: ReplayBuffer) -> LoggedRows:
-    """In the order in which they were added, one environment after the other."""
+    """In the order in which they were added, one environment after the other.
+
+    A buffer with ``optimize_memory_usage`` has lost what each episode ended in, the newest step aside: the last steps
+    of its episodes are left out.
+    """
     size, position = buffer.buffer_size, buffer.pos
     steps = (np.arange(size) + position) % size if buffer.full else np.arange(position)
     if isinstance(buffer, DictReplayBuffer):
         before, after = flatten(buffer.observations)[steps], flatten(buffer.next_observations)[steps]
     elif buffer.optimize_memory_usage:
-        # The next observation stands where the next step's is, and has overwritten the oldest step's own.
+        # The next observation stands where the next step's own is, and has overwritten the oldest step's. At an
+        # episode's end the reset's has come in its place.
         steps = steps[1:] if buffer.full else steps
         before, after = buffer.observations[steps], buffer.observations[(steps + 1) % size]
     else:
@@ -134,7 +139,10 @@ def _of_buffer(buffer: ReplayBuffer) -> LoggedRows:
     episode = np.cumsum(dones, axis=0) - dones
     episode = episode + np.concatenate([[0], np.cumsum(episode.max(axis=0, initial=0) + 1)[:-1]])
     columns = (before, buffer.actions[steps], after, buffer.rewards[steps], terminated, episode)
-    return LoggedRows(*(column.swapaxes(0, 1).reshape(-1, *column.shape[2:]) for column in columns))
+    known = np.ones_like(dones)
+    if buffer.optimize_memory_usage:
+        known[:-1] = ~dones[:-1]
+    return LoggedRows(*(column.swapaxes(0, 1)[known.T] for column in columns))
 
 
 def _flat_actions(action: ndarray, space: spaces.Box) -> ndarray:

@@ -56,7 +56,7 @@ class MPCAgent(ActingAgent):
         num_particles: P, worlds drawn for each plan.
         actions_per_plan: actions performed of each plan before the next one is made.
         learning_starts: transitions before the first training, of random actions if they were not logged; default:
-            those of one episode in each environment.
+            those of one episode in each environment, or ``train_freq`` if these come first.
         train_freq: environment steps between two trainings, for tasks that never end or whose episodes are very long
             or very short; default: one at every episode's start.
         time_budget: seconds that a plan may take, drawing its worlds included; the best plan found by then is used.
@@ -107,7 +107,7 @@ class MPCAgent(ActingAgent):
         May be called again: data and model persist, and random actions are not repeated. With
         ``reset_num_timesteps=False`` counting, logs and a running episode go on where they were. Training belongs to
         an episode's start; it is also done when the last step ends an episode, so that the agent one gets has seen
-        every finished episode.
+        every finished episode. After a stop by a callback, ``learn(0, reset_num_timesteps=False)`` does so.
 
         An environment that was stepped by others in between (`evaluate_policy` on the very object that the agent
         learns in) cannot go on where it was: then leave ``reset_num_timesteps`` as it is, or call ``set_env`` first.
@@ -260,7 +260,7 @@ class MPCAgent(ActingAgent):
         # The logger comes last, and SB3 makes none where there is one of the user's.
         makes_logger, self._custom_logger = not self._custom_logger, True
         try:
-            found = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+            total_timesteps, _ = super()._setup_learn(total_timesteps, None, reset_num_timesteps, tb_log_name)
         finally:
             self._custom_logger = not makes_logger
         if self._safeguard is not None:
@@ -274,7 +274,8 @@ class MPCAgent(ActingAgent):
         if self.verbose >= 1 and not self._has_described:
             print(self.task.describe(can_learn_termination=self.learns_termination), flush=True)
             self._has_described = True
-        return found
+        # Callbacks come last, for they may use the logger as soon as they are given the agent.
+        return total_timesteps, self._init_callback(callback, progress_bar)
 
     def _new_logger(self, tb_log_name: str, reset_num_timesteps: bool) -> Logger:
         """SB3's, in the folder of the run if there is one, else in the next or the newest of that name."""

@@ -17,7 +17,7 @@ from tests.agents.point_mass import LENGTH, KnownPointMass, actions_of
 PLANNING = {"horizon": 4, "num_candidates": 30, "num_iterations": 2, "seed": 0}
 TINY = {
     PETSAgent: {"num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4), "num_particles": 5, **PLANNING},
-    GPMPCAgent: {"num_inducing": 8, "max_training_iterations": 10, "num_particles": 3, **PLANNING},
+    GPMPCAgent: {"num_inducing": 8, "max_training_iterations": 10, "num_particles": 4, **PLANNING},
 }
 AGENTS = list(TINY)
 SETTINGS = [
@@ -84,7 +84,7 @@ def test_the_cart_pole_by_its_id(agent_class, tmp_path):
         (PETSAgent, {"weight_decay": (1e-4,)}, "weight_decay must hold one number"),
         (PETSAgent, {"learning_rate": -1.0}, "learning_rate must be positive, received -1.0"),
         (PETSAgent, {"num_elites": 31}, "num_elites .*31 of 30"),
-        (GPMPCAgent, {"draw": "AMM", "num_particles": 2}, "more particles than the 2 numbers .* num_particles = 2"),
+        (GPMPCAgent, {"draw": "AMM", "num_particles": 3}, "more particles than the 3 numbers .* num_particles = 3"),
         (GPMPCAgent, {"draw": "AMM", "kernel": "matern12"}, "kernel 'rbf' only, received 'matern12'"),
         (GPMPCAgent, {"num_inducing": 0}, "num_inducing must be at least 1, received 0"),
         (GPMPCAgent, {"max_training_iterations": 0}, "max_iterations must be at least 1, received 0"),

@@ -95,18 +95,23 @@ def test_a_reward_is_found_under_wrappers():
 @pytest.mark.parametrize(
     ("function", "error", "message"),
     [
-        (lambda o, a, n: -n, ValueError, r"float tensor \[3, 2\].*returned torch.float32 of shape \[3, 2, 2\]"),
+        (lambda o, a, n: -n, ValueError, r"float tensor \[4, 3, 3\].*returned torch.float32 of shape \[4, 3, 3, 2\]"),
         (lambda o, a, n: -n.sum(), ValueError, r"returned torch.float32 of shape \[\]"),
         (lambda o, a, n: n[..., 0] > 0, ValueError, "returned torch.bool"),
         (lambda o, a, n: n[..., 0].int(), ValueError, "returned torch.int32"),
         (lambda o, a, n: n[..., 0].to("meta"), ValueError, "on the device of the batch, cpu. It returned one on meta"),
         (lambda o, a, n: n[..., 5], ValueError, "raised IndexError"),
         (lambda o, a: a, ValueError, "raised TypeError"),
+        (lambda o, a, n: -(n**2).sum(2), ValueError, r"returned torch.float32 of shape \[4, 3, 2\]"),
+        (lambda o, a, n: -a.view(-1), ValueError, "raised RuntimeError: view size is not compatible"),
+        (lambda o, a, n: n.sub_(1.0)[..., 0], ValueError, "changed the tensors that it was given"),
         (lambda o, a, n: n.numpy()[..., 0], TypeError, "returned ndarray"),
     ],
 )
 def test_a_reward_function_that_does_not_fit_is_tried_and_named(function, error, message):
-    with pytest.raises(error, match=rf"(?s)reward_fn must map .*\[3, 2, 2\], \[3, 2, 1\], \[3, 2, 2\].*{message}"):
+    with pytest.raises(
+        error, match=rf"(?s)reward_fn must map .*\[4, 3, 3, 2\], \[4, 3, 3, 1\], \[4, 3, 3, 2\].*{message}"
+    ):
         agent(reward_fn=function)
 
 
@@ -117,7 +122,7 @@ def test_a_reward_that_is_no_function(unchecked):
 
 @pytest.mark.parametrize("function", [lambda n: n[..., 0], lambda n: n > 0])
 def test_a_termination_function_that_does_not_fit(function):
-    with pytest.raises(ValueError, match=r"terminated_fn must map .*bool tensor \[3, 2\]"):
+    with pytest.raises(ValueError, match=r"terminated_fn must map .*bool tensor \[4, 3, 3\]"):
         agent(terminated_fn=function)
 
 

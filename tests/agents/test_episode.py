@@ -25,6 +25,17 @@ def test_steps_beyond_the_end_are_left_out_of_what_was_obtained():
     assert record_of([1.0, 2.0, 4.0], {2: 6.0}).predicted_and_obtained() == (3.0, 4.0)
 
 
+def test_steps_that_a_plan_has_beyond_a_termination_earn_nothing():
+    record = record_of([1.0, 1.0, 1.0], {0: 2.0, 2: 1.0})
+    assert record.predicted_and_obtained() == (0.75, 1.0)
+    record.add_reward(0.0, terminated=True)
+    record.rewards.pop()
+    assert record.predicted_and_obtained() == (0.75, 0.75)
+    loaded = EpisodeRecord(3, 2)
+    loaded.load_state_dict(record.state_dict())
+    assert loaded.predicted_and_obtained() == (0.75, 0.75)
+
+
 def test_metrics():
     metrics = record_of([1.0, 2.0, 4.0, 8.0], {0: 3.0, 2: 20.0}).metrics()
     assert metrics["rollout/ep_return"] == 15.0

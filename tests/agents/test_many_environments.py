@@ -199,6 +199,12 @@ def test_a_task_that_never_ends_trains_every_so_many_steps(tmp_path):
     assert torch.equal(loaded.store.transitions().next_observation, whole.next_observation)
 
 
+def test_a_task_that_never_ends_is_explored_until_the_first_training_is_due():
+    learner = agent(Endless(), train_freq=8).learn(20)
+    assert learner.dynamics.fits == [8, 16]
+    assert not learner.is_exploring
+
+
 def test_training_every_so_many_steps_goes_before_episodes():
     learner = agent(train_freq=15).learn(50)
     assert learner.dynamics.fits == [10, 25, 40]

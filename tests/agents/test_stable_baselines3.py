@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import (
     CallbackList,
     CheckpointCallback,
     EvalCallback,
+    StopTrainingOnMaxEpisodes,
     StopTrainingOnRewardThreshold,
 )
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -82,6 +83,25 @@ def test_training_stops_at_a_reward_threshold():
     watch = EvalCallback(Monitor(KnownPointMass()), callback_on_new_best=stop, eval_freq=12, verbose=0)
     learner.learn(100, callback=[watch])
     assert learner.num_timesteps == 12
+
+
+def test_a_callback_has_the_logger_from_the_first():
+    class Early(BaseCallback):
+        def _init_callback(self):
+            self.logger.record("mine/value", 3.0)
+
+        def _on_step(self):
+            return True
+
+    learner = agent()
+    learner.learn(3, callback=[Early()])
+    assert learner.logger.name_to_value["mine/value"] == 3.0
+
+
+def test_after_a_callbacks_stop_the_last_episode_is_learned_from_on_demand():
+    learner = agent().learn(100, callback=StopTrainingOnMaxEpisodes(2, verbose=0))
+    assert (len(learner.store), learner.num_fitted) == (20, 10)
+    assert learner.learn(0, reset_num_timesteps=False).num_fitted == 20
 
 
 def test_checkpoints_and_users_callbacks(tmp_path):
