@@ -59,7 +59,7 @@ def _need(extra: str) -> None:
     try:
         __import__({"ray": "ray", "dask": "distributed"}[extra])
     except ModuleNotFoundError as error:
-        raise ClusterError(f"{error.name} is not installed: pip install 'gym-dgpmpc[{extra}]'") from error
+        raise ClusterError(f"{error.name} is not installed: it comes with this package's extra {extra!r}") from error
 
 
 def _on_this_machine(jobs: Sequence[Job], folders: Folders, num_processes: int) -> Iterator[tuple[Job, Outcome]]:

@@ -2,7 +2,7 @@
 
     gymnasium.make("gym_dgpmpc.envs.robotics:FetchReachDense-v4")
 
-imports it by itself. Needs the extra ``gym-dgpmpc[robotics]``.
+imports it by itself. Needs the extra ``robotics``.
 """
 
 from types import SimpleNamespace
