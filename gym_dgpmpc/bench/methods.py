@@ -126,11 +126,13 @@ def true_dynamics_agent(
     num_elites: int | None = None,
     num_iterations: int = 5,
     actions_per_plan: int = 1,
+    learning_starts: int | None = None,
     seed: int | None = None,
     verbose: int = 0,
     tensorboard_log: str | None = None,
 ) -> MPCAgent:
-    """An agent that plans with the simulator itself: one world, and nothing to learn after the first step.
+    """An agent that plans with the simulator itself, in one world. It learns nothing from its random actions, which it
+    takes all the same: where an episode depends on how many there were before, it meets those that the others meet.
 
     Raises:
         ValueError: the environment's simulator cannot be used; see `Simulator`.
@@ -150,7 +152,7 @@ def true_dynamics_agent(
         planner,
         num_particles=1,
         actions_per_plan=actions_per_plan,
-        learning_starts=1,
+        learning_starts=learning_starts,
         seed=seed,
         verbose=verbose,
         tensorboard_log=tensorboard_log,

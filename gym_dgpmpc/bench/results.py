@@ -26,7 +26,7 @@ class Episode(NamedTuple):
     """One episode that was played."""
 
     actions: Actions
-    """"random" before the first training, "planned" by a planner, "policy" by a model-free method."""
+    """"random" if its first actions were, "planned" by a planner, "policy" by a model-free method."""
     episode_return: float
     steps: int
     total_steps: int

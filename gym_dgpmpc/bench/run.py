@@ -163,7 +163,8 @@ class Run:
                 env,
                 partial(method.make, settings=settings, seed=self.seed),
                 num_episodes=self.episodes,
-                total_timesteps=self.max_steps,
+                # Planning may begin in the middle of an episode, which then is none of those that are asked for.
+                total_timesteps=self.max_steps + (self.task.episode_steps if settings.get("learning_starts") else 0),
                 results_only=True,
             )
             if not run.is_complete:
@@ -266,7 +267,7 @@ class _EpisodeList(BaseCallback):
         now = time.perf_counter()
         self.found.append(
             Episode(
-                actions="random" if self.num_timesteps <= self.num_random else "policy",
+                actions="random" if self.num_timesteps - len(episode.rewards) < self.num_random else "policy",
                 episode_return=float(episode.rewards.sum()),
                 steps=len(episode.rewards),
                 total_steps=self.num_timesteps,

@@ -182,7 +182,9 @@ def _set_up_run(
         if max_steps is None:
             raise ValueError(f"episodes of {env_id} have no time limit and may never end: give --timesteps")
         episodes = episodes or DEFAULT_EPISODES
-        timesteps = (arguments["learning_starts"] or max_steps) + episodes * max_steps
+        starts = arguments["learning_starts"]
+        # Planning may begin in the middle of an episode, which then is none of those that are asked for.
+        timesteps = (max_steps if starts is None else starts + max_steps) + episodes * max_steps
     folder = RunFolder(
         out or Path("runs") / f"{env_id}-seed{arguments['seed']}",
         {"environment": env_id, **arguments},

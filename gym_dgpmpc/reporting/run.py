@@ -42,7 +42,7 @@ class EpisodeRow(NamedTuple):
     episode: int
     """Counts from 1, the random ones included."""
     actions: str
-    """"random" or "planned"."""
+    """"random" if its first actions were, else "planned"."""
     episode_return: float
     steps: int
     total_steps: int
@@ -294,14 +294,15 @@ class _KeepEpisodes(BaseCallback):
         assert episode is not None
         rows = folder.rows()
         success = self.locals["infos"][0].get("is_success")
+        record = agent.episode_records[0]
         row = EpisodeRow(
             episode=len(rows) + 1,
-            actions="planned" if agent.is_fitted else "random",
+            actions="planned" if record.plan_steps[:1] == [0] else "random",  # as its first actions were
             episode_return=float(episode.rewards.sum()),
             steps=len(episode.rewards),
             total_steps=agent.num_timesteps,
             seconds=round(time.perf_counter() - self._since, 3),
-            planning_seconds=round(sum(agent.episode_records[0].plan_seconds), 3),
+            planning_seconds=round(sum(record.plan_seconds), 3),
             success=None if success is None else bool(success),
         )
         folder.write_rows([*rows, row])

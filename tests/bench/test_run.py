@@ -39,8 +39,7 @@ def test_every_method_leaves_its_result(method, folders):
     told = run.perform(folders)
     assert run.is_finished(folders.results)
     result = RunResult.read(folders.results / run.file_name)
-    is_random = {"PPO": 0, "true dynamics": 0}.get(method, 1)
-    count = 2 if method == "true dynamics" else 3
+    is_random, count = 0 if method == "PPO" else 1, 3
     assert [episode.total_steps for episode in result.episodes] == [EPISODE_STEPS * (1 + i) for i in range(count)]
     assert {episode.steps for episode in result.episodes} == {EPISODE_STEPS}
     acting = "policy" if METHODS[method].is_model_free else "planned"
@@ -138,9 +137,20 @@ def test_short_episodes_are_counted(folders):
     run.perform(folders)
     result = RunResult.read(folders.results / run.file_name)
     assert [(episode.actions, episode.total_steps) for episode in result.episodes] == [
-        ("random", 5), ("policy", 10), ("policy", 15), ("policy", 20),
+        ("random", 5), ("random", 10), ("policy", 15), ("policy", 20),
     ]  # fmt: skip
     assert run.is_finished(folders.results)
+
+
+def test_an_episode_that_begins_at_random_is_not_one_of_those_that_are_asked_for(folders):
+    run = tiny(DGP, toy(terminate_at=5), episodes=2, asked={"learning_starts": 7})
+    run.perform(folders)
+    episodes = RunResult.read(folders.results / run.file_name).episodes
+    assert [episode.actions for episode in episodes] == ["random", "random", "planned", "planned"]
+    assert run.is_finished(folders.results)
+    longest = tiny(DGP, episodes=2, asked={"learning_starts": EPISODE_STEPS + 1}, task=toy())
+    longest.perform(folders._replace(results=folders.results / "b", work=folders.work / "b"))
+    assert longest.is_finished(folders.results / "b")
 
 
 def test_other_settings_are_no_finished_run(folders):
