@@ -237,6 +237,24 @@ def test_a_task_with_a_goal(run):
         del gymnasium.registry["GoalOfTheTests-v0"]
 
 
+def test_a_task_in_a_module_that_lies_in_the_folder(run, tmp_path, monkeypatch):
+    (tmp_path / "mine_of_the_tests.py").write_text(
+        "import gymnasium\nfrom tests.reporting.toy import ToyPush\n\n\nclass Mine(ToyPush):\n    pass\n\n\n"
+        'gymnasium.register("Mine-v0", Mine, max_episode_steps=12)\n'
+    )
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    try:
+        command = ("train", "mine_of_the_tests:Mine-v0", *SMALLEST, "--episodes", 1, "--no-video", "--out", "a")
+        result = run(*command)
+        assert result.exit_code == 0, result.output
+        del gymnasium.registry["Mine-v0"], sys.modules["mine_of_the_tests"]  # as in a process of its own
+        assert run("evaluate", "a", "--episodes", 1).exit_code == 0
+        assert is_one_line_error(run("train", "no_such_module:Mine-v0"), "needs the Python module no_such_module")
+    finally:
+        gymnasium.registry.pop("Mine-v0", None)
+        sys.modules.pop("mine_of_the_tests", None)
+
+
 def test_a_task_without_end(run):
     often = ["--timesteps", 30, "--random-steps", 8, "--train-freq", 9, "--no-video", "--out", "a"]
     assert run("train", "ToyPushForever-v0", *SMALLEST, *often).exit_code == 0
@@ -262,7 +280,7 @@ def test_limits_of_options(run, option):
 
 
 def test_evaluate_says_what_is_wrong(run, tmp_path):
-    assert is_one_line_error(run("evaluate", "nothing.zip"), "nothing.zip")
+    assert is_one_line_error(run("evaluate", "nothing.zip"), "expected a folder of `dgpmpc train`", "nothing.zip")
     assert is_one_line_error(run("evaluate", "."), "agent.zip")
     (tmp_path / "text.zip").write_text("no agent")
     assert is_one_line_error(run("evaluate", "text.zip"), "text.zip")

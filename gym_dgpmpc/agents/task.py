@@ -205,12 +205,19 @@ def offered_by(env: VecEnv | None, name: str) -> Any:
 
 
 def environment_id(env: VecEnv | None) -> str | None:
-    """What `gymnasium.make` makes the environment from, once this package is imported; None if it is not registered."""
+    """What `gymnasium.make` makes the environment from, once this package is imported; None if it is not registered.
+
+    The module of an environment from elsewhere stands before its id, for importing that is what registers it.
+    """
     spec = offered_by(env, "spec")
     if spec is None:
         return None
-    is_robotics = str(spec.entry_point).startswith("gymnasium_robotics.")
-    return f"gym_dgpmpc.envs.robotics:{spec.id}" if is_robotics else spec.id
+    entry = spec.entry_point
+    module = entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "__main__")
+    package = module.partition(".")[0]
+    if package == "gymnasium_robotics":
+        return f"gym_dgpmpc.envs.robotics:{spec.id}"
+    return spec.id if package in ("gymnasium", "gym_dgpmpc", "__main__") else f"{module}:{spec.id}"
 
 
 def describe(env: VecEnv | None) -> str:

@@ -1,6 +1,7 @@
 """What the commands have in common: errors on one line, exit codes, threads, making an environment."""
 
 import os
+import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -55,7 +56,10 @@ def prepare_video(env_id: str) -> str:
 
 
 def make(env_id: str, *, render: bool) -> gymnasium.Env:
+    if ":" in env_id and os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())  # a module of the user's own lies here, as for `python -m`
     try:
         return gymnasium.make(env_id, render_mode="rgb_array") if render else gymnasium.make(env_id)
     except ModuleNotFoundError as error:
-        raise ValueError(f"the environment {env_id} needs the Python module {error.name}, which is missing") from error
+        module = error.name or env_id.partition(":")[0]
+        raise ValueError(f"the environment {env_id} needs the Python module {module}, which is missing") from error

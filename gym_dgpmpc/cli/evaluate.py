@@ -44,6 +44,8 @@ def evaluate(
     with one_line_errors(ValueError, AssertionError, OSError):
         use_threads(threads)
         file = path / NEWEST if path.is_dir() else path
+        if not file.is_file():
+            raise ValueError(f"expected a folder of `dgpmpc train` or an agent's file, but there is no file {file}")
         env_id = env_id or read_checkpoint(file).config.get("environment")
         if env_id is None:
             raise ValueError(f"{file} does not say which environment it was trained in: give --env ENV_ID")

@@ -121,6 +121,8 @@ def test_jobs_that_are_no_runs(bench, monkeypatch, tmp_path):
         (["--methods", "SAC"], ["no method 'SAC' in this suite; there are PPO, tiny"]),
         (["--seeds", "a"], ["seeds are numbers and ranges such as 0,1,5-9, got 'a'"]),
         (["--seeds", "0,-1"], ["got '0,-1'"]),
+        (["--seeds", "5-3"], ["got '5-3'"]),
+        (["--seeds", "1-"], ["got '1-'"]),
         (["--cluster", "mars"], ["a cluster is ray"]),
     ],
 )
