@@ -11,6 +11,7 @@ P particles, H horizon.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import index
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -33,6 +34,8 @@ class Transitions(NamedTuple):
 class ObservationSpec:
     """How a dynamics model should read an observation. All fields hold indices into the observation.
 
+    Lists, and integers of numpy's, are kept as tuples of Python's.
+
     Attributes:
         angles: enter the model as sine and cosine (the predicted change stays in radians).
         absolute: the model predicts the next value itself, not the change.
@@ -43,6 +46,9 @@ class ObservationSpec:
             on a floor, and the angle in rad, anticlockwise, of the body to them. The model is fed the vector, and
             predicts its change, along the body's axes: what was learned under one heading then holds under all. Where
             nothing else depends on the heading, put it in ``not_inputs``.
+
+    Raises:
+        TypeError: an index is not an integer.
     """
 
     angles: tuple[int, ...] = ()
@@ -50,6 +56,11 @@ class ObservationSpec:
     not_inputs: tuple[int, ...] = ()
     constant: tuple[int, ...] = ()
     body_frame: tuple[tuple[int, int, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("angles", "absolute", "not_inputs", "constant"):
+            object.__setattr__(self, name, tuple(map(index, getattr(self, name))))
+        object.__setattr__(self, "body_frame", tuple(tuple(map(index, triple)) for triple in self.body_frame))
 
 
 @runtime_checkable

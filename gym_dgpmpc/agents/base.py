@@ -15,9 +15,10 @@ from stable_baselines3.common.utils import get_system_info, safe_mean
 from gym_dgpmpc.agents.checkpoint import CheckpointPath, write_checkpoint
 from gym_dgpmpc.agents.composition import ComposedAgent
 from gym_dgpmpc.agents.dict_observations import flatten
+from gym_dgpmpc.agents.loading import load_agent
 from gym_dgpmpc.agents.plan_state import PlanState, PolicyState, pack, unpack
 from gym_dgpmpc.agents.randomness import observation_generator
-from gym_dgpmpc.agents.saving import collect, load_agent
+from gym_dgpmpc.agents.saving import collect
 from gym_dgpmpc.agents.task import (
     flat_size,
 )
@@ -119,7 +120,8 @@ class PlanningAgent(ComposedAgent):
             exclude, include: of SB3's signature; without effect.
 
         Raises:
-            CheckpointWriteError: the file cannot be written; the old one is whole. It is an OSError too.
+            CheckpointWriteError: the file cannot be written, or is more than `load` would read; the old one is whole.
+                It is an OSError too.
         """
         write_checkpoint(collect(self), path)
 
@@ -139,15 +141,21 @@ class PlanningAgent(ComposedAgent):
         Args:
             path: what `save` was given.
             env: the environment to go on in, or its id; None serves prediction, and then a reward that was not learned
-                must be given.
-            device: where planning computes.
+                must be given, and the termination function if the environment offered one.
+            device: where planning computes. On another kind than the agent was saved on, new random streams begin.
             custom_objects: of SB3's signature; without effect, since nothing is unpickled.
             print_system_info: print versions of this system.
             force_reset: begin a new episode when learning goes on; False continues the one that was running, for an
                 ``env`` that is still in it.
             kwargs: arguments of the constructor in place of the saved ones: ``reward_fn`` and ``terminated_fn`` if
                 they were given to the agent that was saved, ``dynamics`` and ``planner`` of a plain `MPCAgent`,
-                ``verbose``, ``tensorboard_log`` and so on. With ``seed`` the random streams begin afresh.
+                ``verbose``, ``tensorboard_log`` and so on. With ``seed`` the random streams begin afresh, the
+                environment's included; with another horizon or fewer actions per plan, the plan does.
+
+        Warns:
+            UserWarning: the saved agent planned with a termination function, and there is none now (without an
+                environment, `predict` says so).
+            ReliabilityWarning: it was saved on another kind of device.
 
         Raises:
             FileNotFoundError: there is no such file.

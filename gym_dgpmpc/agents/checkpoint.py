@@ -21,13 +21,13 @@ from safetensors.numpy import save as save_arrays
 from torch import Tensor
 
 from gym_dgpmpc.agents.files import replace_file
-from gym_dgpmpc.agents.reading import UnsafeFileError, open_members, parse_json, parse_tensors
+from gym_dgpmpc.agents.reading import UnsafeFileError, check_members, open_members, parse_json, parse_tensors
 from gym_dgpmpc.errors import CheckpointError, CheckpointWriteError
 
 FORMAT = "gym_dgpmpc agent"
-SCHEMA = 3
+SCHEMA = 4
 """1: without what a running episode needs to go on. 2: of one environment, whose reward was not learned. Either is
-without the arguments added since (see `saving.py`)."""
+without the arguments added since (see `saving.py`). 3: with the episodes that logged means are over as plain values."""
 
 CheckpointPath = str | os.PathLike[str] | IO[bytes] | io.BufferedIOBase
 
@@ -50,21 +50,20 @@ def write_checkpoint(checkpoint: Checkpoint, path: CheckpointPath, previous: Pat
     """Write to a file, replacing an old one only when the new one is complete and on disk.
 
     Args:
-        checkpoint: its config must be JSON-serialisable.
+        checkpoint: its config is plain values that JSON has.
         path: see `checkpoint_path`; missing folders are made. A binary file object is written to as it is, without
             those guarantees.
         previous: keep the old file under this name.
 
     Raises:
-        CheckpointWriteError: the file cannot be written; an old one is untouched. It is an OSError too.
+        CheckpointWriteError: the file cannot be written, or could not be read again; an old one is untouched. It is
+            an OSError too.
     """
-    members = {"config.json": _to_json(checkpoint.config)}
-    for name, tensors in checkpoint.tensors.items():
-        # As arrays: for tensors safetensors makes a ctypes type of each size, which Python keeps for ever.
-        arrays = {key: tensor.detach().cpu().contiguous().numpy() for key, tensor in tensors.items()}
-        members[f"{name}.safetensors"] = save_arrays(arrays)
-    table = {name: {"bytes": len(data), "sha256": _sha256(data)} for name, data in members.items()}
-    members["manifest.json"] = _to_json({"format": FORMAT, "schema": SCHEMA, "members": table})
+    try:
+        members = _members(checkpoint)
+        check_members(members)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise CheckpointWriteError(f"{_named(path)} is not written, for it could not be read again: {error}") from error
     if not isinstance(path, str | os.PathLike):
         _write_zip(members, path)
         return
@@ -76,6 +75,22 @@ def write_checkpoint(checkpoint: Checkpoint, path: CheckpointPath, previous: Pat
         raise CheckpointWriteError(error.errno, f"could not write {target}: {error.strerror or error}{kept}") from error
 
 
+def _members(checkpoint: Checkpoint) -> dict[str, bytes]:
+    """Everything that the file holds, by name.
+
+    Raises:
+        TypeError, ValueError: a value of the config is not one that JSON has.
+    """
+    members = {"config.json": _to_json(checkpoint.config)}
+    for name, tensors in checkpoint.tensors.items():
+        # As arrays: for tensors safetensors makes a ctypes type of each size, which Python keeps for ever.
+        arrays = {key: tensor.detach().cpu().contiguous().numpy() for key, tensor in tensors.items()}
+        members[f"{name}.safetensors"] = save_arrays(arrays)
+    table = {name: {"bytes": len(data), "sha256": _sha256(data)} for name, data in members.items()}
+    members["manifest.json"] = _to_json({"format": FORMAT, "schema": SCHEMA, "members": table})
+    return members
+
+
 def read_checkpoint(path: CheckpointPath) -> Checkpoint:
     """Read and verify a file; "PATH.zip" is tried where PATH does not exist.
 
@@ -84,7 +99,7 @@ def read_checkpoint(path: CheckpointPath) -> Checkpoint:
         CheckpointError: it is not a checkpoint, is damaged, or was written by a newer version of this package.
     """
     if not isinstance(path, str | os.PathLike):
-        return _read(path, getattr(path, "name", "the given file object"))
+        return _read(path, _named(path))
     source = Path(path)
     if not source.exists() and source.with_name(f"{source.name}.zip").exists():
         source = source.with_name(f"{source.name}.zip")
@@ -94,6 +109,13 @@ def read_checkpoint(path: CheckpointPath) -> Checkpoint:
         raise CheckpointError(f"{source} is not a regular file")
     with open(source, "rb") as file:
         return _read(file, str(source))
+
+
+def _named(path: CheckpointPath) -> str:
+    """What an error calls the file."""
+    if isinstance(path, str | os.PathLike):
+        return str(checkpoint_path(path))
+    return str(getattr(path, "name", "the given file object"))
 
 
 def _read(file: IO[bytes] | io.BufferedIOBase, where: str) -> Checkpoint:

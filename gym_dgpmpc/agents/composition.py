@@ -3,8 +3,9 @@
 `base.py` makes it a Stable-Baselines3 algorithm.
 """
 
+import os
 import warnings
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -82,7 +83,7 @@ class ComposedAgent(BaseAlgorithm):
         train_freq: int | None = None,
         time_budget: float | None = None,
         stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
+        tensorboard_log: str | os.PathLike[str] | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: torch.device | str = "cpu",
@@ -98,7 +99,7 @@ class ComposedAgent(BaseAlgorithm):
             env=env,
             learning_rate=0.0,  # the base class wants one; the dynamics model has its own
             stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
+            tensorboard_log=None if tensorboard_log is None else os.fspath(tensorboard_log),
             device=device,
             seed=seed,
             support_multi_env=True,
@@ -116,6 +117,9 @@ class ComposedAgent(BaseAlgorithm):
         self.learning_starts, self.train_freq, self.time_budget = learning_starts, train_freq, time_budget
         self.observation_spec = observation_spec
         self.given_reward_fn, self.given_terminated_fn = reward_fn, terminated_fn
+        # Of the file that the agent was loaded from: what it says of its environment, for the next file.
+        self._about_environment: dict[str, Any] = {}
+        self._had_terminated_fn = False
         self.seeds_environment = seed is not None
         self.seed = fresh_seed() if seed is None else seed
         if _init_setup_model:
@@ -176,6 +180,17 @@ class ComposedAgent(BaseAlgorithm):
         return self._can_model_more and self.task.terminated_source == LEARNED
 
     @property
+    def lacks_terminated_fn(self) -> bool:
+        """Whether the agent was loaded from the file of one that planned with a termination function, and has none.
+
+        An environment that says that its episodes never end is no lack, nor is a wish to learn when they do.
+        """
+        if self._task is None or not self._had_terminated_fn:
+            return self._had_terminated_fn
+        is_unknown = self._task.terminated_fn is None and self._task.terminated_source == LEARNED
+        return is_unknown and self.given_terminated_fn != LEARNED
+
+    @property
     def is_fitted(self) -> bool:
         """Whether the dynamics model has been trained."""
         return self.num_fitted > 0
@@ -196,6 +211,11 @@ class ComposedAgent(BaseAlgorithm):
             self._task = self._find_task()
         if self._task.reward_fn is None and not self.modelled.reward:
             raise self._unknown_reward()
+        if self.lacks_terminated_fn:
+            self._warn_once(
+                "the saved agent planned with a termination function, and this one has none: it plans as if episodes "
+                "did not end. Pass terminated_fn=... to load, or an environment that offers it"
+            )
         return self._task
 
     def _unknown_reward(self, env: VecEnv | None = None) -> UnknownRewardError:

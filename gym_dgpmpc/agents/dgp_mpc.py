@@ -3,6 +3,7 @@
 Gadd et al. (2020), "Sample-Efficient Reinforcement Learning using Deep Gaussian Processes".
 """
 
+import os
 from typing import ClassVar
 
 import torch
@@ -127,7 +128,7 @@ class DGPMPCAgent(MPCAgent):
         terminated_fn: TerminatedFn | Learned | None = None,
         observation_spec: ObservationSpec | None = None,
         stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
+        tensorboard_log: str | os.PathLike[str] | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: torch.device | str = "cpu",

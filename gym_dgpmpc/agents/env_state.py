@@ -251,10 +251,8 @@ def _plain(value: Any) -> Any:
     """A bit generator's state with arrays as lists, and numpy's integers as Python's."""
     if isinstance(value, dict):
         return {name: _plain(each) for name, each in value.items()}
-    return {"array": value.tolist(), "dtype": str(value.dtype)} if isinstance(value, ndarray) else _number(value)
-
-
-def _number(value: Any) -> Any:
+    if isinstance(value, ndarray):
+        return {"array": value.tolist(), "dtype": str(value.dtype)}
     return value if isinstance(value, str) else int(value)
 
 

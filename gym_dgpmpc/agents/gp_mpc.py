@@ -3,6 +3,7 @@
 The Gaussian-process baselines of Chua et al. (2018) and of Gadd et al. (2020): GP-DS and GP-MM.
 """
 
+import os
 from typing import ClassVar
 
 import torch
@@ -99,7 +100,7 @@ class GPMPCAgent(MPCAgent):
         terminated_fn: TerminatedFn | Learned | None = None,
         observation_spec: ObservationSpec | None = None,
         stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
+        tensorboard_log: str | os.PathLike[str] | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: torch.device | str = "cpu",

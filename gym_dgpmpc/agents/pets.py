@@ -3,6 +3,7 @@
 Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials using Probabilistic Dynamics Models".
 """
 
+import os
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -111,7 +112,7 @@ class PETSAgent(MPCAgent):
         terminated_fn: TerminatedFn | Learned | None = None,
         observation_spec: ObservationSpec | None = None,
         stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
+        tensorboard_log: str | os.PathLike[str] | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: torch.device | str = "cpu",

@@ -39,7 +39,7 @@ class Generators(NamedTuple):
             generator.set_state(state[name])
 
 
-STREAMS = (*Generators._fields, "deterministic_prediction", "environment", "forecast")
+STREAMS = (*Generators._fields, "deterministic_prediction", "environment", "forecast", "other_device")
 
 
 def derive_seed(seed: int, stream: str, *key: int) -> int:

@@ -10,6 +10,7 @@ import math
 import os
 import struct
 import zipfile
+from collections.abc import Mapping
 from typing import IO, Any
 
 from safetensors.torch import load as load_tensors
@@ -24,8 +25,9 @@ MAX_NESTING = 32
 MAX_DIGITS = 400
 MAX_MEMBER_ENTRY_BYTES = 1024  # of one member's entry in the zip's table
 
-ITEM_BYTES = {"F64": 8, "F32": 4, "F16": 2, "BF16": 2, "I64": 8, "I32": 4, "U8": 1, "BOOL": 1}
-"""The kinds of tensors that agents hold, and the bytes of a number."""
+_INTEGER_BYTES = {"I64": 8, "I32": 4, "I16": 2, "I8": 1, "U64": 8, "U32": 4, "U16": 2, "U8": 1}
+ITEM_BYTES = {"F64": 8, "F32": 4, "F16": 2, "BF16": 2, "BOOL": 1, **_INTEGER_BYTES}
+"""The kinds of tensors that agents hold (any integers may be bounds of actions), and the bytes of a number."""
 
 _END = struct.Struct("<4s4H2LH")
 _END_SIGNATURE, _LOCATOR_SIGNATURE, _LOCATOR_BYTES = b"PK\x05\x06", b"PK\x06\x07", 20
@@ -51,13 +53,30 @@ def open_members(file: IO[bytes] | io.BufferedIOBase) -> dict[str, bytes]:
         if len({entry.filename for entry in entries}) != len(entries):
             raise UnsafeFileError("it has repeated members")
         for entry in entries:
-            limit = MAX_JSON_BYTES if entry.filename.endswith(".json") else size
             stored = entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
-            if not stored or entry.file_size > limit:
-                raise UnsafeFileError(f"its member {entry.filename!r} is compressed or larger than it may be")
+            if not stored or entry.file_size > size:
+                raise UnsafeFileError(f"its member {entry.filename!r} is compressed or larger than the file")
+            _check_member_size(entry.filename, entry.file_size)
         if sum(entry.file_size for entry in entries) > size:
             raise UnsafeFileError("its members overlap")
         return {entry.filename: archive.read(entry) for entry in entries}
+
+
+def check_members(members: Mapping[str, bytes]) -> None:
+    """Refuse what could not be read again, before it is written: the limits of a reader are those of a writer.
+
+    Raises:
+        UnsafeFileError: a member is larger than it may be, or not what `parse_json` or `parse_tensors` takes.
+    """
+    size = sum(map(len, members.values())) + MAX_MEMBERS * MAX_MEMBER_ENTRY_BYTES
+    if size > MAX_FILE_BYTES:
+        raise UnsafeFileError(f"it would have {size} bytes, more than an agent's file may have ({MAX_FILE_BYTES})")
+    for name, data in members.items():
+        _check_member_size(name, len(data))
+        if name.endswith(".json"):
+            parse_json(data)
+        else:
+            _check_tensors(data)
 
 
 def parse_json(data: bytes) -> dict[str, Any]:
@@ -83,11 +102,23 @@ def parse_tensors(data: bytes) -> dict[str, Tensor]:
         UnsafeFileError: it does not.
         SafetensorError: the library finds something else.
     """
+    _check_tensors(data)
+    return load_tensors(data)
+
+
+def _check_member_size(name: str, size: int) -> None:
+    if name.endswith(".json") and size > MAX_JSON_BYTES:
+        raise UnsafeFileError(f"its member {name!r} has {size} bytes, more than it may have ({MAX_JSON_BYTES})")
+
+
+def _check_tensors(data: bytes) -> None:
     if len(data) < 8:
         raise UnsafeFileError(f"it has {len(data)} bytes, less than a header")
     (header_size,) = struct.unpack("<Q", data[:8])
     if header_size > min(MAX_HEADER_BYTES, len(data) - 8):
-        raise UnsafeFileError(f"its header claims {header_size} bytes")
+        raise UnsafeFileError(
+            f"its header claims {header_size} bytes of {len(data) - 8}, and may have {MAX_HEADER_BYTES}"
+        )
     header = parse_json(data[8 : 8 + header_size])
     header.pop("__metadata__", None)
     end = 0
@@ -98,7 +129,6 @@ def parse_tensors(data: bytes) -> dict[str, Tensor]:
         end = tensor_end
     if end != len(data) - 8 - header_size:
         raise UnsafeFileError(f"its tensors claim {end} bytes of {len(data) - 8 - header_size}")
-    return load_tensors(data)
 
 
 def _check_table(file: IO[bytes] | io.BufferedIOBase, size: int) -> None:

@@ -8,9 +8,10 @@ from numpy import ndarray
 
 from gym_dgpmpc.agents.checkpoint import Checkpoint
 from gym_dgpmpc.agents.env_state import replay, return_to_start, set_options, set_present_generators
+from gym_dgpmpc.agents.loading import restore
 from gym_dgpmpc.agents.randomness import derive_seed
 from gym_dgpmpc.agents.saved import saved_arguments, saved_running, saved_spaces
-from gym_dgpmpc.agents.saving import encode, restore, to_learn
+from gym_dgpmpc.agents.saving import encode, to_learn
 from gym_dgpmpc.errors import CheckpointError, ReliabilityWarning
 
 MAY_DIFFER = {"verbose", "tensorboard_log", "stats_window_size", "time_budget"}

@@ -135,16 +135,14 @@ def saved_running(checkpoint: Checkpoint) -> list[dict[str, Any]]:
     return running
 
 
-def _index(value: Any) -> Any:
-    """An index of an `ObservationSpec`, or a tuple of them."""
-    return tuple(map(int, value)) if isinstance(value, list) else int(value)
+def _as_tuple(value: Any) -> Any:
+    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
 
 
 def _decode(value: Any) -> Any:
     if not isinstance(value, dict):
         return value
     try:
-        fields = value["observation_spec"].items()
-        return ObservationSpec(**{name: tuple(map(_index, indices)) for name, indices in fields})
+        return ObservationSpec(**{name: _as_tuple(indices) for name, indices in value["observation_spec"].items()})
     except Exception as error:
         raise CheckpointError(f"the file holds an argument that cannot be read: {value}") from error

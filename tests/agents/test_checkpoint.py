@@ -16,7 +16,7 @@ from gymnasium import spaces
 from gym_dgpmpc import MPCAgent
 from gym_dgpmpc.agents import reading
 from gym_dgpmpc.agents.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from gym_dgpmpc.errors import CheckpointError, UnknownRewardError
+from gym_dgpmpc.errors import CheckpointError, CheckpointWriteError, ReliabilityWarning, UnknownRewardError
 from tests.agents.point_mass import (
     LENGTH,
     KnownPointMass,
@@ -120,9 +120,6 @@ def test_the_same_agent_gives_the_same_bytes(tmp_path):
     for name in ("one", "other"):
         agent(tensorboard_log=None).learn(9).save(tmp_path / name)
     one, other = (read_checkpoint(tmp_path / name) for name in ("one", "other"))
-    for config in (one.config, other.config):
-        for info in config["episode_infos"]:
-            info.pop("t")
     for checkpoint_ in (one, other):
         checkpoint_.tensors["agent"].pop("record.0.seconds")  # wall-clock time
     assert one.config == other.config
@@ -159,6 +156,176 @@ def test_arguments_can_be_replaced(saved):
     assert not torch.equal(reseeded.generators.planning.get_state(), load(saved).generators.planning.get_state())
     with pytest.raises(CheckpointError, match="no_such_argument"):
         load(saved, no_such_argument=1)
+
+
+def test_a_new_seed_seeds_the_environment_of_an_agent_that_had_none(tmp_path):
+    agent(seed=None).learn(LENGTH).save(tmp_path / "agent")
+
+    def first_observation(**arguments):
+        loaded = load(tmp_path / "agent", env=KnownPointMass(), **arguments).learn(1)
+        return loaded.store.transitions().observation[LENGTH].tolist()
+
+    assert first_observation(seed=5) == first_observation(seed=5) != first_observation(seed=6)
+    assert first_observation() != first_observation()
+
+
+@pytest.mark.parametrize("replaced", [{"planner": planner(horizon=7)}, {"actions_per_plan": 1}])
+def test_a_plan_that_no_longer_fits_begins_anew(replaced, saved):
+    assert load(saved)._running[0].carried.age == 1
+    replaced = {"env": KnownPointMass(), "dynamics": LinearModel(), "planner": planner(), **replaced}
+    loaded = MPCAgent.load(saved, **replaced)
+    assert loaded._running[0].carried is loaded.planning.cold
+    assert loaded.learn(LENGTH, reset_num_timesteps=False).num_timesteps == 25 + LENGTH
+
+
+class Ending(KnownPointMass):
+    """Offers a function that says when its episodes end."""
+
+    terminated_fn = staticmethod(lambda after: after[..., 0].abs() > 9.0)
+
+
+@pytest.fixture(scope="module")
+def saved_with_termination(tmp_path_factory):
+    path = tmp_path_factory.mktemp("saved") / "agent.zip"
+    agent(Ending()).learn(LENGTH).save(path)
+    return path
+
+
+def test_a_termination_function_that_is_missing_is_told_of(saved_with_termination, tmp_path):
+    parts = {"dynamics": LinearModel(), "planner": planner(), "reward_fn": reward_fn}
+    alone = MPCAgent.load(saved_with_termination, **parts)
+    with pytest.warns(UserWarning, match=r"planned with a termination function.*terminated_fn="):
+        alone.predict(OBSERVATIONS[0])
+    with pytest.warns(UserWarning, match="planned with a termination function"):
+        load(saved_with_termination, env=KnownPointMass())
+    alone.save(tmp_path / "again")
+    with pytest.warns(UserWarning, match="planned with a termination function"):
+        MPCAgent.load(tmp_path / "again", **parts).predict(OBSERVATIONS[0])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_termination_function_that_is_given_again_or_not_wanted_needs_no_warning(saved_with_termination, saved):
+    parts = {"dynamics": LinearModel(), "planner": planner(), "reward_fn": reward_fn}
+    given = MPCAgent.load(saved_with_termination, terminated_fn=Ending.terminated_fn, **parts)
+    given.predict(OBSERVATIONS[0])
+    assert given.task.terminated_fn is Ending.terminated_fn
+    MPCAgent.load(saved_with_termination, terminated_fn="learned", **parts).predict(OBSERVATIONS[0])
+    MPCAgent.load(saved, **parts).predict(OBSERVATIONS[0])
+    never = KnownPointMass()
+    never.terminated_fn = None
+    load(saved_with_termination, env=never)
+    later = MPCAgent.load(saved_with_termination, dynamics=LinearModel(), planner=planner())
+    later.set_env(Ending())
+    later.predict(OBSERVATIONS[0])
+
+
+def test_an_agent_without_environment_saves_what_its_file_said_of_one(tmp_path):
+    from gym_dgpmpc import DGPMPCAgent
+    from tests.reporting.toy import SMALLEST_AGENT
+
+    DGPMPCAgent("ToyPush-v0", seed=0, **SMALLEST_AGENT).save(tmp_path / "one")
+    DGPMPCAgent.load(tmp_path / "one").save(tmp_path / "other")
+    one, other = (read_checkpoint(tmp_path / name).config for name in ("one", "other"))
+    about = ("environment", "observation_parts", "reset_options", "has_terminated_fn")
+    assert one["environment"] == "ToyPush-v0"
+    assert [one[name] for name in about] == [other[name] for name in about]
+
+
+def as_if_saved_on_cuda(config, tensors):
+    config["device"] = "cuda"
+    for state in tensors["generators"].values():
+        state.resize_(16)  # what CUDA's have
+
+
+def test_a_file_of_another_kind_of_device_begins_new_random_streams(saved, tmp_path):
+    path = changed(saved, tmp_path / "cuda.zip", as_if_saved_on_cuda)
+    loaded = []
+    for _ in range(2):
+        with pytest.warns(ReliabilityWarning, match=r"saved on the device 'cuda'.*'cpu'"):
+            loaded.append(load(path))
+    one, other = (each.generators.state_dict() for each in loaded)
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    fresh = agent(KnownPointMass(), actions_per_plan=2).generators
+    assert not torch.equal(one["planning"], fresh.planning.get_state())  # would repeat the first run's numbers
+    assert loaded[0].learn(LENGTH, reset_num_timesteps=False).num_timesteps == 25 + LENGTH
+
+
+def test_the_episodes_of_logged_means_come_back_however_many_they_are(tmp_path):
+    learned = agent(stats_window_size=300_000).learn(12)
+    infos = [{"r": -1.5 * i, "l": 10.0, "t": 0.1 * i, "a_keyword_of_a_monitor": 1 / (i + 1)} for i in range(10_000)]
+    infos[7]["only_here"] = 3.0
+    learned.ep_info_buffer.extend(infos)
+    learned.ep_success_buffer.extend([True, False] * 150_000)
+    learned.save(tmp_path / "agent")
+    loaded = load(tmp_path / "agent")
+    assert loaded.ep_info_buffer == learned.ep_info_buffer
+    assert loaded.ep_success_buffer == learned.ep_success_buffer
+    assert loaded.ep_info_buffer.maxlen == loaded.ep_success_buffer.maxlen == 300_000
+
+
+def test_what_is_no_number_in_a_monitors_summary_is_left_out(tmp_path):
+    learned = agent().learn(1)
+    learned.ep_info_buffer.extend([{"r": np.float32(1.0), "l": 3, "map": "maze"}, {"r": 2.0, "l": 4, "map": None}])
+    learned.save(tmp_path / "agent")
+    assert list(load(tmp_path / "agent").ep_info_buffer) == [{"r": 1.0, "l": 3.0}, {"r": 2.0, "l": 4.0}]
+
+
+@pytest.mark.parametrize("kind", ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"])
+def test_bounds_of_actions_may_be_integers_of_any_kind(kind, tmp_path):
+    def env():
+        made = KnownPointMass()
+        made.action_space = spaces.Box(0, 2, (1,), np.dtype(kind).type)
+        return made
+
+    agent(env()).save(tmp_path / "agent")
+    assert load(tmp_path / "agent", env=env()).action_space == env().action_space
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c, t: c.update(versions="x" * reading.MAX_JSON_BYTES), r"'config.json' has \d+ bytes, more than"),
+        (lambda c, t: c.update(versions={"a": np.int64(3)}), "int64 is not JSON serializable"),
+        (lambda c, t: c.update(versions={"a": np.nan}), "not JSON compliant"),
+        (lambda c, t: c.update(versions=10**500), "a number of 501 digits"),
+        (lambda c, t: t["agent"].update({"x" * reading.MAX_HEADER_BYTES: torch.zeros(1)}), "its header claims"),
+        (lambda c, t: t["agent"].update(bound=torch.zeros(1, dtype=torch.complex64)), "of the kind 'C64'"),
+    ],
+)
+def test_what_could_not_be_read_again_is_not_written(change, message, saved, tmp_path):
+    path = Path(shutil.copy(saved, tmp_path / "agent.zip"))
+    with pytest.raises(CheckpointWriteError, match=f"agent.zip is not written, .*{message}"):
+        changed(saved, path, change)
+    assert path.read_bytes() == saved.read_bytes()
+
+
+def test_a_file_that_would_be_too_large_is_not_written(saved, tmp_path, monkeypatch):
+    checkpoint = read_checkpoint(saved)
+    monkeypatch.setattr(reading, "MAX_FILE_BYTES", 100)
+    with pytest.raises(CheckpointWriteError, match=r"bytes, more than an agent's file may have \(100\)"):
+        write_checkpoint(checkpoint, io.BytesIO())
+
+
+def test_an_agent_that_could_not_be_loaded_again_is_not_saved(tmp_path):
+    larger = agent(num_particles=20_000)
+    with pytest.raises(CheckpointWriteError, match=r"could not be loaded again: .*num_particles = 20000 is larger"):
+        larger.learn(LENGTH, run_folder=tmp_path)
+    assert larger.num_timesteps == 0  # before anything can be lost
+
+
+def test_numbers_of_numpy_and_paths_are_saved_as_pythons(tmp_path, unchecked):
+    from gym_dgpmpc import DGPMPCAgent
+    from tests.reporting.toy import SMALLEST_AGENT
+
+    numbers = {"horizon": np.int64(4), "step_size": np.float32(0.5), "time_budget": np.float64(9)}
+    DGPMPCAgent("ToyPush-v0", **{**SMALLEST_AGENT, **numbers}).save(tmp_path / "agent")
+    loaded = DGPMPCAgent.load(tmp_path / "agent")
+    for name, number in numbers.items():
+        assert getattr(loaded, name) == number
+        assert type(getattr(loaded, name)) is type(number.item())
+    agent(tensorboard_log=tmp_path / "logs").learn(12).save(tmp_path / "agent")
+    assert load(tmp_path / "agent").tensorboard_log == str(tmp_path / "logs")
+    assert (tmp_path / "logs" / "MPC_1").is_dir()
 
 
 def test_other_spaces_are_named(saved):
@@ -265,7 +432,7 @@ def test_a_newer_schema_says_what_to_do(saved, tmp_path):
     members = members_of(saved)
     manifest = json.loads(members["manifest.json"])
     members["manifest.json"] = json.dumps(manifest | {"schema": 99}).encode()
-    with pytest.raises(CheckpointError, match=r"schema 99.*reads up to 3.*version that wrote it"):
+    with pytest.raises(CheckpointError, match=r"schema 99.*reads up to 4.*version that wrote it"):
         load(zipped(tmp_path / "file.zip", members))
     members["manifest.json"] = json.dumps(manifest | {"format": "something else"}).encode()
     with pytest.raises(CheckpointError, match="its format is 'something else'"):
@@ -301,7 +468,7 @@ def test_compressed_additional_and_repeated_members(saved, tmp_path):
 
 def test_sizes_are_bounded(saved, tmp_path, monkeypatch):
     monkeypatch.setattr(reading, "MAX_JSON_BYTES", 100)
-    with pytest.raises(CheckpointError, match=r"'config.json' is compressed or larger"):
+    with pytest.raises(CheckpointError, match=r"'config.json' has \d+ bytes, more than it may"):
         load(saved)
     monkeypatch.setattr(reading, "MAX_FILE_BYTES", 100)
     with pytest.raises(CheckpointError, match="more than an agent's file may have"):
@@ -351,6 +518,18 @@ def test_contents_that_do_not_fit_are_named(change, message, saved, tmp_path):
         load(changed(saved, tmp_path / "changed.zip", change))
 
 
+def test_a_file_of_the_third_schema_goes_on():
+    """Written by the package when it still kept the episodes of logged means as plain values."""
+    from tests.reporting.toy import EPISODE_STEPS
+
+    path = Path(__file__).parent / "files" / "schema3.zip"
+    assert read_checkpoint(path).schema == 3
+    loaded = MPCAgent.load(path, env="ToyPush-v0")
+    assert [info["l"] for info in loaded.ep_info_buffer] == [EPISODE_STEPS] * 2
+    assert loaded.num_timesteps == len(loaded.store) == 2 * EPISODE_STEPS + 1
+    assert len(loaded.learn(EPISODE_STEPS, reset_num_timesteps=False).ep_info_buffer) == 3
+
+
 def test_a_file_of_the_second_schema_goes_on():
     """Written within an episode, by the package before it knew of several environments and of learned rewards."""
     from tests.reporting import toy
@@ -390,7 +569,7 @@ def test_a_run_of_the_first_schema_goes_on(tmp_path):
     learner = DGPMPCAgent("ToyPush-v0", seed=0, **SMALLEST_AGENT)
     learner.learn(3 * EPISODE_STEPS, run_folder=tmp_path, resume=True)
     assert learner.num_timesteps == 3 * EPISODE_STEPS
-    assert read_checkpoint(tmp_path / "agent.zip").schema == 3
+    assert read_checkpoint(tmp_path / "agent.zip").schema == 4
 
 
 def test_classes_are_checked(saved, tmp_path):

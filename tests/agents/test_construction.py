@@ -9,6 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from gym_dgpmpc.errors import UnknownRewardError
+from gym_dgpmpc.types import ObservationSpec
 from tests.agents.point_mass import KnownPointMass, PointMass, agent, reward_fn
 
 
@@ -165,3 +166,11 @@ def test_actions_of_two_dimensions():
     action, _ = learner.predict(np.zeros(2), deterministic=True)
     assert action.shape == (1, 1)
     assert action.dtype == np.float64
+
+
+def test_an_observation_spec_holds_tuples_of_integers(unchecked):
+    given = ObservationSpec(angles=[1], constant=tuple(np.flatnonzero([0, 1, 1])), body_frame=[[0, 1, 2]])
+    assert given == ObservationSpec(angles=(1,), constant=(1, 2), body_frame=((0, 1, 2),))
+    assert type(given.constant[0]) is int
+    with pytest.raises(TypeError, match="float"):
+        ObservationSpec(angles=[1.0])

@@ -10,7 +10,7 @@ from tensorboard.compat.proto.event_pb2 import Event
 
 from gym_dgpmpc.agents.checkpoint import read_checkpoint
 
-CLOCK = {"record.0.seconds", "record.0.plan_seconds"}
+CLOCK = {"record.0.seconds", "record.0.plan_seconds", "ep_info.t"}
 """Tensors of a checkpoint that tell the time."""
 CLOCK_COLUMNS = {"seconds", "planning_seconds"}
 CLOCK_TAGS = ("time/", "train/seconds")
@@ -76,8 +76,6 @@ def _same_points(tag, one, other):
 
 
 def _without_clock(name, value):
-    if name == "episode_infos":
-        return [{key: number for key, number in info.items() if key != "t"} for info in value]
     if name == "pending_logs":
         return [entry for entry in value if not entry[0].startswith(CLOCK_TAGS)]
     if name == "arguments":

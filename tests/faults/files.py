@@ -23,7 +23,7 @@ import torch
 from safetensors.torch import save as save_tensors
 
 from gym_dgpmpc import DGPMPCAgent
-from gym_dgpmpc.agents.checkpoint import read_checkpoint
+from gym_dgpmpc.agents.checkpoint import SCHEMA, read_checkpoint
 from gym_dgpmpc.agents.randomness import Generators
 from gym_dgpmpc.errors import DGPMPCError
 from tests.faults.kills import TINY
@@ -51,7 +51,7 @@ def zipped(members, **options):
     """A zip of these members with a manifest that fits them, so that checks beyond the checksums are reached."""
     members = {name: data for name, data in members.items() if name != "manifest.json"}
     table = {name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in members.items()}
-    manifest = {"format": "gym_dgpmpc agent", "schema": 2, "members": table}
+    manifest = {"format": "gym_dgpmpc agent", "schema": SCHEMA, "members": table}
     return raw_zip({**members, "manifest.json": json.dumps(manifest).encode()}, **options)
 
 
