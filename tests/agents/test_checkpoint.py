@@ -227,7 +227,7 @@ def test_an_agent_without_environment_saves_what_its_file_said_of_one(tmp_path):
     DGPMPCAgent.load(tmp_path / "one").save(tmp_path / "other")
     one, other = (read_checkpoint(tmp_path / name).config for name in ("one", "other"))
     about = ("environment", "observation_parts", "reset_options", "has_terminated_fn")
-    assert one["environment"] == "ToyPush-v0"
+    assert one["environment"] == "tests.reporting.toy:ToyPush-v0"
     assert [one[name] for name in about] == [other[name] for name in about]
 
 
