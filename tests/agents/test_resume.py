@@ -208,6 +208,16 @@ def test_a_run_that_never_began_leaves_its_folder_free(tmp_path):
     assert len(train(tmp_path, resume=False, total=12).store) == 12
 
 
+def test_the_run_of_another_environment_is_refused(tmp_path):
+    def learn(env_id):
+        agent(gymnasium.make(env_id), reward_fn=lambda o, a, n: n[..., 0]).learn(4, run_folder=tmp_path, resume=True)
+
+    learn("ModCartPole-v0")
+    with pytest.raises(CheckpointError, match=r"the environment was ModCartPole-v0, now SwingUpCartPole-v0"):
+        learn("SwingUpCartPole-v0")
+    learn("ModCartPole-v0")
+
+
 def test_another_agents_run_is_refused(tmp_path):
     train(tmp_path, total=12)
     with pytest.raises(CheckpointError, match=r"other settings: num_particles was 5, now 6; seed was 0, now 1"):
