@@ -106,6 +106,7 @@ def _find_reward(env: VecEnv | None, given: RewardFn | Learned | None) -> tuple[
         return offered, "the environment's"
     goal_reward = GoalReward.of(env)
     if goal_reward is not None:
+        assert env is not None
         if offered_by(env, "reward_type") == "sparse":
             warnings.warn(
                 f"{describe(env)} has sparse rewards, in which a planner has nothing to climb until it stands at the "
@@ -213,10 +214,8 @@ def environment_id(env: VecEnv | None) -> str | None:
     return f"gym_dgpmpc.envs.robotics:{spec.id}" if is_robotics else spec.id
 
 
-def describe(env: VecEnv | None) -> str:
+def describe(env: VecEnv) -> str:
     """The environment's id if it is a registered one, else its class."""
-    if env is None:
-        return "the agent has no environment: none"
     spec = offered_by(env, "spec")
     return f"the environment {spec.id}" if spec is not None else f"the environment {offered_by(env, 'unwrapped')}"
 

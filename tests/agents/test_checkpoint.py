@@ -138,7 +138,7 @@ def test_rewards_that_were_given_are_given_again(tmp_path):
 
 def test_without_an_environment_an_agent_predicts_if_it_is_given_the_reward(saved):
     parts = {"dynamics": LinearModel(), "planner": planner()}
-    with pytest.raises(UnknownRewardError, match="no environment"):
+    with pytest.raises(UnknownRewardError, match="the agent has no environment and no reward_fn was passed"):
         MPCAgent.load(saved, **parts).predict(OBSERVATIONS[0])
     alone = MPCAgent.load(saved, reward_fn=reward_fn, **parts)
     expected = load(saved).predict(OBSERVATIONS[0], deterministic=True)[0]
