@@ -170,8 +170,8 @@ def check_env(env: VecEnv) -> None:
     """Refuse what cannot be planned for, naming what was received.
 
     Raises:
-        ValueError: an observation that is not a vector of real numbers, an unbounded action, or normalised
-            observations.
+        ValueError: an observation that is not a vector of real numbers, an action that is unbounded or not of real
+            numbers, or normalised observations.
         AssertionError: an action space that is not a Box, as from every SB3 algorithm.
     """
     observation, action = env.observation_space, env.action_space
@@ -185,6 +185,11 @@ def check_env(env: VecEnv) -> None:
         f"The algorithm only supports {spaces.Box} as action spaces but {action} was provided: "
         "the planner searches real-valued action sequences. For discrete actions see SB3's DQN or PPO"
     )
+    if action.dtype.kind != "f":
+        raise ValueError(
+            f"the planner searches real-valued actions: the action space must be a Box of floats, got {action}. "
+            "gymnasium.wrappers.TransformAction can round them for an environment that takes whole numbers"
+        )
     bad = ~(np.isfinite(action.low) & np.isfinite(action.high) & (action.low <= action.high))
     if bad.any():
         where = "" if bad.all() else f" (those at {np.argwhere(bad).tolist()} are not)"

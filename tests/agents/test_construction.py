@@ -29,6 +29,11 @@ def test_unbounded_actions():
         agent(with_spaces(action=spaces.Box(-np.inf, 1.0, (1,), np.float32)))
 
 
+def test_whole_numbers_as_actions():
+    with pytest.raises(ValueError, match=r"must be a Box of floats, got Box\(0, 5, \(1,\), int64\)"):
+        agent(with_spaces(action=spaces.Box(0, 5, (1,), np.int64)))
+
+
 def test_mixed_action_bounds_name_the_ones_that_are_missing():
     low, high = np.array([-1.0, 0.0, -np.inf]), np.array([1.0, np.inf, 3.0])
     with pytest.raises(ValueError, match=r"those at \[\[1\], \[2\]\] are not\), got low = \[ -1"):
