@@ -1,8 +1,10 @@
 """What the agent must know of its environment: given by the user, found on it, known of its class, or to be learned."""
 
 import warnings
+from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -12,12 +14,13 @@ from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     VecCheckNan,
     VecEnv,
+    VecEnvWrapper,
     VecMonitor,
     VecNormalize,
     unwrap_vec_normalize,
 )
 
-from gym_dgpmpc.agents.dict_observations import GoalReward, flattened, goal_spec
+from gym_dgpmpc.agents.dict_observations import FlatDict, GoalReward, flattened, goal_spec
 from gym_dgpmpc.agents.env_state import remember_starts
 from gym_dgpmpc.agents.first_batch import check_reward, check_termination
 from gym_dgpmpc.envs import known
@@ -146,13 +149,42 @@ def find_observation_spec(env: VecEnv | None, observation_spec: ObservationSpec 
     """How the dynamics model should read observations, found as `find_task` finds what it looks for.
 
     Of a goal environment the goal is constant and no input; all else is read as it is.
+
+    Raises:
+        ValueError: between the agent and what the environment offers stands a wrapper that may change observations. In
+            another process none is seen.
     """
-    if observation_spec is None:
-        observation_spec = offered_by(env, "observation_spec")
     if observation_spec is not None:
+        return observation_spec
+    observation_spec = offered_by(env, "observation_spec")
+    if observation_spec is not None:
+        _refuse_changed_observations(env)
         return observation_spec
     task = known_task(env)
     return goal_spec(env) if task is None else task.observation_spec
+
+
+def _refuse_changed_observations(env: VecEnv | None) -> None:
+    for wrapper in _wrappers_around("observation_spec", env):
+        is_harmless = isinstance(wrapper, (*HARMLESS_VEC_WRAPPERS, FlatDict))
+        if not is_harmless and known.may_change_observations(wrapper):
+            raise ValueError(
+                f"the environment offers an observation_spec, but the wrapper {type(wrapper).__name__} around it may "
+                "change what its numbers mean: pass observation_spec=... to the agent, of the observations that it is "
+                "given, or ObservationSpec() to read them as they are. The class of a wrapper that leaves observations "
+                "alone may say so with an attribute keeps_observations = True"
+            )
+
+
+def _wrappers_around(name: str, env: VecEnv | None) -> Iterator[VecEnvWrapper | gym.Wrapper]:
+    """The wrappers between the agent and what has this attribute, but for those in another process."""
+    while isinstance(env, VecEnvWrapper):
+        yield env
+        env = env.venv
+    layer = env.envs[0] if isinstance(env, DummyVecEnv) else None
+    while isinstance(layer, gym.Wrapper) and not hasattr(layer, name):
+        yield layer
+        layer = layer.env
 
 
 def known_task(env: VecEnv | None) -> known.KnownTask | None:
