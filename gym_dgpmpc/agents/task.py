@@ -238,8 +238,19 @@ def check_env(env: VecEnv) -> None:
 
 
 def offered_by(env: VecEnv | None, name: str) -> Any:
-    """An attribute of the (first) environment under all its wrappers, or None."""
-    return env.get_attr(name)[0] if env is not None and env.has_attr(name) else None
+    """An attribute of the (first) environment under all its wrappers, or None.
+
+    Raises:
+        ValueError: it cannot be sent from the process that the environment runs in, which has ended of it.
+    """
+    try:
+        return env.get_attr(name)[0] if env is not None and env.has_attr(name) else None
+    except (EOFError, ConnectionError) as error:
+        raise ValueError(
+            f"the environment's attribute {name!r} cannot be sent from the process that it runs in (its own error is "
+            "printed above): what is pickled must be a function or class at the top level of a module, not a lambda or "
+            f"a function within another. Or make the environment without it and pass {name}=... to the agent"
+        ) from error
 
 
 def environment_id(env: VecEnv | None) -> str | None:

@@ -146,6 +146,25 @@ def test_a_wrapper_may_say_how_its_own_observations_are_read():
     assert find_observation_spec(env, None) == ObservationSpec(angles=(2,))
 
 
+class Closure(KnownPointMass):
+    """Offers what cannot be sent to another process."""
+
+    def __init__(self):
+        super().__init__()
+        self.reward_fn = lambda o, a, n: n[..., 0]
+
+
+def test_a_reward_that_cannot_leave_its_process_is_named():
+    env = SubprocVecEnv([Closure])
+    try:
+        with pytest.raises(ValueError, match=r"attribute 'reward_fn' cannot be sent from the process.*reward_fn="):
+            found(env)
+    finally:
+        for process in env.processes:  # as the worker died, `close` would fail
+            process.join()
+        env.closed = True
+
+
 def test_the_agent_says_it_once(capsys):
     learner = agent(gym.make("Pendulum-v1"), verbose=1)
     learner.learn(2)
