@@ -168,7 +168,7 @@ def test_signals_end_a_run_with_their_exit_codes(run, tmp_path, monkeypatch, num
     monkeypatch.chdir(tmp_path)
     result = run(*command)
     assert result.exit_code == 0, result.output
-    assert "goes on after step 12" in result.stdout
+    assert "goes on after step 16" in result.stdout
     assert "return of 3 planned episodes" in result.stdout
 
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import get_system_info, safe_mean
 
 from gym_dgpmpc.agents.checkpoint import CheckpointPath, write_checkpoint
 from gym_dgpmpc.agents.composition import ComposedAgent
-from gym_dgpmpc.agents.dict_observations import flatten
+from gym_dgpmpc.agents.dict_observations import check_parts, flatten, layout
 from gym_dgpmpc.agents.loading import load_agent
 from gym_dgpmpc.agents.plan_state import PlanState, PolicyState, pack, unpack
 from gym_dgpmpc.agents.randomness import observation_generator
@@ -57,7 +57,7 @@ class PlanningAgent(ComposedAgent):
             middle of the action range, or uniformly random actions unless ``deterministic``.
 
         Raises:
-            ValueError: observation or state has the wrong shape.
+            ValueError: observation or state has the wrong shape, or a dict other parts than the environment's.
             EnvironmentDataError: the observation is not finite.
             UnknownRewardError: the agent was loaded without an environment and without a reward function.
             PlanningError: no candidate plan had a finite return.
@@ -180,10 +180,11 @@ class PlanningAgent(ComposedAgent):
 
     def _checked_observations(self, observation: Any) -> tuple[np.ndarray, bool]:
         """Observations as float32 [n, S], and whether they came with that first dimension."""
+        check_parts(observation, layout(self.env))
         array = np.asarray(flatten(observation), dtype=np.float32)
         size = flat_size(self.observation_space)
         if array.ndim not in (1, 2) or array.shape[-1] != size:
-            raise ValueError(f"expected an observation of shape ({size},) or (n, {size}), got {np.shape(observation)}")
+            raise ValueError(f"expected an observation of shape ({size},) or (n, {size}), got {array.shape}")
         if not np.all(np.isfinite(array)):
             raise EnvironmentDataError(f"cannot plan from an observation that is not finite: {observation}")
         return array.reshape(-1, size), array.ndim == 2

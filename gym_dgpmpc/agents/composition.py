@@ -13,6 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from gym_dgpmpc.agents.dict_observations import FlatDict
@@ -220,12 +221,13 @@ class ComposedAgent(BaseAlgorithm):
 
     def _unknown_reward(self, env: VecEnv | None = None) -> UnknownRewardError:
         """The error that says what to pass, of an environment in place of the agent's own."""
+        env = self.env if env is None else env
+        lacks = "the agent has no environment" if env is None else f"{describe(env)} has no attribute 'reward_fn'"
         return UnknownRewardError(
-            f"{describe(self.env if env is None else env)} has no attribute 'reward_fn' and none was passed; nor was "
-            "this agent's model made to predict the reward (a ready-made one cannot be: pass dynamics=... as a "
-            "function of observation size, action size and observation spec that makes one). Planning scores predicted "
-            "trajectories, so it needs the reward as a function of batched torch tensors: pass reward_fn=... to the "
-            "agent or give the environment that attribute, with the signature "
+            f"{lacks} and no reward_fn was passed; nor was this agent's model made to predict the reward (a ready-made "
+            "one cannot be: pass dynamics=... as a function of observation size, action size and observation spec that "
+            "makes one). Planning scores predicted trajectories, so it needs the reward as a function of batched torch "
+            "tensors: pass reward_fn=... to the agent or give the environment that attribute, with the signature "
             f"{REWARD_SIGNATURE} where S = "
             f"{flat_size(self.observation_space)}, A = {flat_size(self.action_space)} and *b stands for any leading "
             "dimensions"
@@ -238,12 +240,15 @@ class ComposedAgent(BaseAlgorithm):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Go on in another environment of the same spaces; its reward is planned with, unless one was given.
 
+        One that is refused leaves the agent as it is.
+
         Raises:
             ValueError: its spaces are others, or it cannot be planned for.
             UnknownRewardError: there is no reward function, and the model was not trained to predict the reward.
         """
         env = wrapped_env(env)
         both_spaces = self.observation_space, self.action_space
+        check_for_correct_spaces(env, *both_spaces)  # first of all, so that a refused one changes nothing
         task = find_task(env, self.given_reward_fn, self.given_terminated_fn, both_spaces, self.device)
         if task.reward_fn is None and not self.modelled.reward:
             if self.is_fitted or not self._can_model_more:

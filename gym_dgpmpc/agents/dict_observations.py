@@ -74,6 +74,23 @@ def flatten(observation: Any) -> Any:
     return np.concatenate([np.asarray(observation[key]) for key in sorted(observation)], axis=-1)
 
 
+def check_parts(observation: Any, parts: dict[str, slice]) -> None:
+    """Refuse a Dict observation, or a batch of them, that has not the parts of `layout`; of no parts nothing is known.
+
+    Raises:
+        ValueError: a part is missing, unknown or of another shape.
+    """
+    if not isinstance(observation, Mapping) or not parts:
+        return
+    expected = {key: (part.stop - part.start,) for key, part in parts.items()}
+    received = {key: np.shape(part) for key, part in observation.items()}
+    batch = next(iter(received.values()), ())[:-1]
+    if len(batch) > 1 or received != {key: (*batch, *shape) for key, shape in expected.items()}:
+        raise ValueError(
+            f"expected a dict of the shapes {expected}, or each with a dimension of n before, got {received}"
+        )
+
+
 def layout_of(space: spaces.Space) -> dict[str, slice]:
     """Where in the vector the parts of a Dict space are."""
     assert isinstance(space, spaces.Dict)

@@ -114,16 +114,17 @@ class MPCAgent(ActingAgent):
 
         Whatever goes wrong, the transitions observed so far stay in ``agent.store``, and `learn` can be called again.
 
-        With a ``run_folder`` they are on disk too: a checkpoint is written at first and after every episode, the last
-        two are kept, and one more is written if something fails. ``resume=True`` makes the same call, in a program that
-        was killed and started again, go on from there, to the same result bit for bit (of several environments: with
-        all data and the same model, in new episodes):
+        With a ``run_folder`` they are on disk too: a checkpoint is written at first, after every episode and before a
+        training within one, the last two are kept, and one more is written if something fails. ``resume=True`` makes
+        the same call, in a program that was killed and started again, go on from there, to the same result bit for bit
+        (of several environments: with all data and the same model, in new episodes):
 
             agent = DGPMPCAgent("ModCartPole-v0", seed=0, tensorboard_log="runs/a/logs")
             agent.learn(total_timesteps=3_200, run_folder="runs/a", resume=True)
 
-        Ctrl-C and SIGTERM then stop `learn` once the running step is finished and a checkpoint written (in simulators;
-        elsewhere that of the last episode's end counts). A second one stops at once.
+        Ctrl-C and SIGTERM then stop `learn` once the running step is finished and a checkpoint written, which holds all
+        steps (where the running episode cannot be repeated, a new one begins when the run goes on). A second one stops
+        at once.
 
         Args:
             total_timesteps: environment steps of this call; with ``resume``, of the whole run.
@@ -226,7 +227,7 @@ class MPCAgent(ActingAgent):
         if self.learns_termination and not self.modelled.terminated and self.store.terminated.any():
             self.new_model(reward=self.modelled.reward, terminated=True)
         started = time.perf_counter()
-        with nullcontext() if self._safeguard is None else self._safeguard.stop.at_any_time():
+        with nullcontext() if self._safeguard is None else self._safeguard.training():
             metrics = dict(self.dynamics.fit(self.modelled.transitions(self.store), self.generators.fit))
         self.num_fitted = len(self.store)
         metrics |= {"num_transitions": self.num_fitted, "seconds": time.perf_counter() - started}

@@ -25,9 +25,8 @@ MAX_NESTING = 32
 MAX_DIGITS = 400
 MAX_MEMBER_ENTRY_BYTES = 1024  # of one member's entry in the zip's table
 
-_INTEGER_BYTES = {"I64": 8, "I32": 4, "I16": 2, "I8": 1, "U64": 8, "U32": 4, "U16": 2, "U8": 1}
-ITEM_BYTES = {"F64": 8, "F32": 4, "F16": 2, "BF16": 2, "BOOL": 1, **_INTEGER_BYTES}
-"""The kinds of tensors that agents hold (any integers may be bounds of actions), and the bytes of a number."""
+ITEM_BYTES = {"F64": 8, "F32": 4, "F16": 2, "BF16": 2, "I64": 8, "I32": 4, "U8": 1, "BOOL": 1}
+"""The kinds of tensors that agents hold, and the bytes of a number."""
 
 _END = struct.Struct("<4s4H2LH")
 _END_SIGNATURE, _LOCATOR_SIGNATURE, _LOCATOR_BYTES = b"PK\x05\x06", b"PK\x06\x07", 20

@@ -12,6 +12,7 @@ from gym_dgpmpc.agents.loading import restore
 from gym_dgpmpc.agents.randomness import derive_seed
 from gym_dgpmpc.agents.saved import saved_arguments, saved_running, saved_spaces
 from gym_dgpmpc.agents.saving import encode, to_learn
+from gym_dgpmpc.agents.task import environment_id
 from gym_dgpmpc.errors import CheckpointError, ReliabilityWarning
 
 MAY_DIFFER = {"verbose", "tensorboard_log", "stats_window_size", "time_budget"}
@@ -29,7 +30,8 @@ def resume_agent(agent: Any, checkpoint: Checkpoint) -> None:
         agent: an `MPCAgent` with an environment; an agent that was made without a seed takes over the checkpoint's.
 
     Raises:
-        CheckpointError: the checkpoint is another agent's; the message says in what.
+        CheckpointError: the checkpoint is another agent's, or of another registered environment; the message says in
+            what.
     """
     _refuse_another(agent, checkpoint)
     restore(agent, checkpoint)
@@ -101,5 +103,9 @@ def _refuse_another(agent: Any, checkpoint: Checkpoint) -> None:
     both = agent.observation_space, agent.action_space
     if saved_spaces(checkpoint) != both:
         differing.append(f"its spaces were {saved_spaces(checkpoint)}, now {both}")
+    ids = checkpoint.config.get("environment"), environment_id(agent.env)
+    # One that is not registered has no id; older files lack the module that registers Gymnasium-Robotics' ones.
+    if None not in ids and len({str(each).rpartition(":")[-1] for each in ids}) > 1:
+        differing.append(f"the environment was {ids[0]}, now {ids[1]}")
     if differing:
         raise CheckpointError(f"the checkpoint is of an agent with other settings: {'; '.join(differing)}")

@@ -2,7 +2,8 @@
 
 import os
 import warnings
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -23,7 +24,8 @@ class Safeguard:
 
     On entering, the folder is taken hold of, and the agent goes on from it if it should. Inside, `begin` writes a first
     checkpoint, so that a run killed within its first episode is known to be one; `after_step` writes checkpoints and
-    heeds requests to stop. On an exception everything gathered so far is written.
+    heeds requests to stop; `training` is around each training. On an exception everything gathered so far is written,
+    unless the run never began.
 
     Args:
         agent: the `MPCAgent` that learns.
@@ -80,7 +82,7 @@ class Safeguard:
                     self._save()
                 if self.stop.received is not None:  # after the last step
                     self.stop.stop()
-            elif isinstance(error, Exception):
+            elif isinstance(error, Exception) and (self._goes_on or self._saved is not None):
                 try:
                     self._save(gives_up=True)
                 except Exception as another:  # must not hide what happened first
@@ -107,8 +109,26 @@ class Safeguard:
         if self.agent.tensorboard_log is not None and self.agent._log_run is not None:
             drop_events_after(self.agent.num_timesteps, Path(self.agent.tensorboard_log) / self.agent._log_run)
 
+    @contextmanager
+    def training(self) -> Iterator[None]:
+        """A context for a training, in which a signal stops at once: it begins with all steps on disk.
+
+        At an episode's start they are there already.
+
+        Raises:
+            KeyboardInterrupt, SystemExit: see `StopRequests`.
+            CheckpointWriteError: the checkpoint cannot be written.
+        """
+        starts = self.agent._last_episode_starts
+        if self._saved != self._present() and starts is not None and not starts.any():
+            self._save()
+        with self.stop.at_any_time():
+            yield
+
     def after_step(self, *, episode_ended: bool) -> None:
         """Write a checkpoint if one is due, and stop if that was asked for.
+
+        Of an episode that cannot be repeated a stop keeps the steps; a new episode begins when the run goes on.
 
         Raises:
             KeyboardInterrupt, SystemExit: see `StopRequests`.
@@ -117,7 +137,7 @@ class Safeguard:
         stopping = self.stop.received is not None
         # A step of n environments is n timesteps, so it may pass over the multiple.
         every = self.every is not None and self.agent.num_timesteps % self.every < self.agent.n_envs
-        if episode_ended or ((stopping or every) and self._can_go_on_within_an_episode()):
+        if episode_ended or stopping or (every and self._can_go_on_within_an_episode()):
             self._save()
         if stopping:
             self.stop.stop()
@@ -126,12 +146,11 @@ class Safeguard:
         start = episode_start(self.agent.env)
         if (start is not None and can_replay(start)) or self.agent.n_envs > 1:  # then episodes begin anew all the same
             return True
-        if self.every is not None:
-            self.agent._warn_once(
-                "checkpoint_every is without effect, because this environment cannot be brought back into the middle "
-                "of an episode: checkpoints are written when episodes end. A simulator that repeats an episode when "
-                "it is given the same actions may say so with an attribute can_replay = True"
-            )
+        self.agent._warn_once(
+            "checkpoint_every is without effect, because this environment cannot be brought back into the middle "
+            "of an episode: checkpoints are written when episodes end. A simulator that repeats an episode when "
+            "it is given the same actions may say so with an attribute can_replay = True"
+        )
         return False
 
     def _save(self, *, gives_up: bool = False) -> None:

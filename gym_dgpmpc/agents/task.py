@@ -1,8 +1,10 @@
 """What the agent must know of its environment: given by the user, found on it, known of its class, or to be learned."""
 
 import warnings
+from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -12,12 +14,13 @@ from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     VecCheckNan,
     VecEnv,
+    VecEnvWrapper,
     VecMonitor,
     VecNormalize,
     unwrap_vec_normalize,
 )
 
-from gym_dgpmpc.agents.dict_observations import GoalReward, flattened, goal_spec
+from gym_dgpmpc.agents.dict_observations import FlatDict, GoalReward, flattened, goal_spec
 from gym_dgpmpc.agents.env_state import remember_starts
 from gym_dgpmpc.agents.first_batch import check_reward, check_termination
 from gym_dgpmpc.envs import known
@@ -106,6 +109,7 @@ def _find_reward(env: VecEnv | None, given: RewardFn | Learned | None) -> tuple[
         return offered, "the environment's"
     goal_reward = GoalReward.of(env)
     if goal_reward is not None:
+        assert env is not None
         if offered_by(env, "reward_type") == "sparse":
             warnings.warn(
                 f"{describe(env)} has sparse rewards, in which a planner has nothing to climb until it stands at the "
@@ -145,13 +149,42 @@ def find_observation_spec(env: VecEnv | None, observation_spec: ObservationSpec 
     """How the dynamics model should read observations, found as `find_task` finds what it looks for.
 
     Of a goal environment the goal is constant and no input; all else is read as it is.
+
+    Raises:
+        ValueError: between the agent and what the environment offers stands a wrapper that may change observations. In
+            another process none is seen.
     """
-    if observation_spec is None:
-        observation_spec = offered_by(env, "observation_spec")
     if observation_spec is not None:
+        return observation_spec
+    observation_spec = offered_by(env, "observation_spec")
+    if observation_spec is not None:
+        _refuse_changed_observations(env)
         return observation_spec
     task = known_task(env)
     return goal_spec(env) if task is None else task.observation_spec
+
+
+def _refuse_changed_observations(env: VecEnv | None) -> None:
+    for wrapper in _wrappers_around("observation_spec", env):
+        is_harmless = isinstance(wrapper, (*HARMLESS_VEC_WRAPPERS, FlatDict))
+        if not is_harmless and known.may_change_observations(wrapper):
+            raise ValueError(
+                f"the environment offers an observation_spec, but the wrapper {type(wrapper).__name__} around it may "
+                "change what its numbers mean: pass observation_spec=... to the agent, of the observations that it is "
+                "given, or ObservationSpec() to read them as they are. The class of a wrapper that leaves observations "
+                "alone may say so with an attribute keeps_observations = True"
+            )
+
+
+def _wrappers_around(name: str, env: VecEnv | None) -> Iterator[VecEnvWrapper | gym.Wrapper]:
+    """The wrappers between the agent and what has this attribute, but for those in another process."""
+    while isinstance(env, VecEnvWrapper):
+        yield env
+        env = env.venv
+    layer = env.envs[0] if isinstance(env, DummyVecEnv) else None
+    while isinstance(layer, gym.Wrapper) and not hasattr(layer, name):
+        yield layer
+        layer = layer.env
 
 
 def known_task(env: VecEnv | None) -> known.KnownTask | None:
@@ -169,8 +202,8 @@ def check_env(env: VecEnv) -> None:
     """Refuse what cannot be planned for, naming what was received.
 
     Raises:
-        ValueError: an observation that is not a vector of real numbers, an unbounded action, or normalised
-            observations.
+        ValueError: an observation that is not a vector of real numbers, an action that is unbounded or not of real
+            numbers, or normalised observations.
         AssertionError: an action space that is not a Box, as from every SB3 algorithm.
     """
     observation, action = env.observation_space, env.action_space
@@ -184,6 +217,11 @@ def check_env(env: VecEnv) -> None:
         f"The algorithm only supports {spaces.Box} as action spaces but {action} was provided: "
         "the planner searches real-valued action sequences. For discrete actions see SB3's DQN or PPO"
     )
+    if action.dtype.kind != "f":
+        raise ValueError(
+            f"the planner searches real-valued actions: the action space must be a Box of floats, got {action}. "
+            "gymnasium.wrappers.TransformAction can round them for an environment that takes whole numbers"
+        )
     bad = ~(np.isfinite(action.low) & np.isfinite(action.high) & (action.low <= action.high))
     if bad.any():
         where = "" if bad.all() else f" (those at {np.argwhere(bad).tolist()} are not)"
@@ -200,8 +238,19 @@ def check_env(env: VecEnv) -> None:
 
 
 def offered_by(env: VecEnv | None, name: str) -> Any:
-    """An attribute of the (first) environment under all its wrappers, or None."""
-    return env.get_attr(name)[0] if env is not None and env.has_attr(name) else None
+    """An attribute of the (first) environment under all its wrappers, or None.
+
+    Raises:
+        ValueError: it cannot be sent from the process that the environment runs in, which has ended of it.
+    """
+    try:
+        return env.get_attr(name)[0] if env is not None and env.has_attr(name) else None
+    except (EOFError, ConnectionError) as error:
+        raise ValueError(
+            f"the environment's attribute {name!r} cannot be sent from the process that it runs in (its own error is "
+            "printed above): what is pickled must be a function or class at the top level of a module, not a lambda or "
+            f"a function within another. Or make the environment without it and pass {name}=... to the agent"
+        ) from error
 
 
 def environment_id(env: VecEnv | None) -> str | None:
@@ -220,10 +269,8 @@ def environment_id(env: VecEnv | None) -> str | None:
     return spec.id if package in ("gymnasium", "gym_dgpmpc", "__main__") else f"{module}:{spec.id}"
 
 
-def describe(env: VecEnv | None) -> str:
+def describe(env: VecEnv) -> str:
     """The environment's id if it is a registered one, else its class."""
-    if env is None:
-        return "the agent has no environment: none"
     spec = offered_by(env, "spec")
     return f"the environment {spec.id}" if spec is not None else f"the environment {offered_by(env, 'unwrapped')}"
 

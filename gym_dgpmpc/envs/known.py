@@ -31,6 +31,14 @@ HARMLESS_WRAPPERS = (
 )
 """Wrappers that intervene in `step` and leave observation, action, reward and termination as they are."""
 
+OBSERVATION_KEEPERS = (
+    gym.ActionWrapper,
+    gym.RewardWrapper,
+    wrappers.DtypeObservation,
+    wrappers.NormalizeReward,
+)
+"""Wrappers that change actions, rewards or the precision alone."""
+
 
 MONITOR = f"{Monitor.__module__}:{Monitor.__qualname__}"
 
@@ -74,12 +82,28 @@ def find(env: gym.Env | EnvSpec) -> KnownTask | None:
         finally:
             made.close()
     while isinstance(env, gym.Wrapper):
-        keeps_task = isinstance(env, HARMLESS_WRAPPERS) or getattr(type(env), "keeps_task", False)
-        if not keeps_task and type(env).step is not gym.Wrapper.step:
+        if _may_change_task(env):
             return None
         env = env.env
     task = _TASKS.get(f"{type(env).__module__}:{type(env).__qualname__}")
     return None if task is None or not _has_its_own_model(env) else task(env)
+
+
+def _may_change_task(wrapper: Any) -> bool:
+    """Whether what is known of an environment may not hold for the wrapped one."""
+    keeps_task = isinstance(wrapper, HARMLESS_WRAPPERS) or getattr(type(wrapper), "keeps_task", False)
+    # A VecEnv's wrapper always has a step of its own.
+    return not keeps_task and getattr(type(wrapper), "step", None) is not gym.Wrapper.step
+
+
+def may_change_observations(wrapper: Any) -> bool:
+    """Whether the observations of an environment may mean something else under this wrapper, of it or of a VecEnv.
+
+    So it is with any that has a `step` of its own, but for those that keep the whole task (see `find`), change actions
+    or rewards alone, or say that they leave observations alone by an attribute ``keeps_observations = True``.
+    """
+    keeps = isinstance(wrapper, OBSERVATION_KEEPERS) or getattr(type(wrapper), "keeps_observations", False)
+    return not keeps and _may_change_task(wrapper)
 
 
 def _has_its_own_model(env: Any) -> bool:

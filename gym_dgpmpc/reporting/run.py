@@ -176,7 +176,8 @@ class TrainingRun:
         env: the environment; if it renders `rgb_array` the last episode becomes a GIF.
         make_agent: makes the agent: (environment, verbose=..., tensorboard_log=...) -> `MPCAgent`.
         num_episodes: planned episodes after which to stop, or None.
-        total_timesteps: environment steps after which to stop, the random ones included.
+        total_timesteps: environment steps after which to stop, the random ones included; with ``num_episodes``, those
+            of an episode that was given up when the run was interrupted do not count.
         checkpoint_every: see `MPCAgent.learn`.
         title: of the figures.
         results_only: print nothing, draw nothing, and leave out what the agent would learn from the last episode,
@@ -207,6 +208,9 @@ class TrainingRun:
         if resume_from(self.agent, folder.checkpoints):
             # An episode whose row was written but whose agent was not saved will be played again.
             rows = [row for row in folder.rows() if row.total_steps <= self.agent.num_timesteps]
+            if num_episodes is not None and self.agent._last_obs is None:
+                # A new episode begins. Steps of those given up, which have no row, cost none of the episodes asked for.
+                self.total_timesteps += self.agent.num_timesteps - sum(row.steps for row in rows)
         folder.write_rows(rows)
         self.figures: list[Path] = []
         """The figures that were drawn, once the last episode has ended."""

@@ -74,6 +74,8 @@ class RiskSensitiveReward(gym.Wrapper, RecordConstructorArgs):
         ValueError: the environment's reward is not known as a function, or an argument is out of its range.
     """
 
+    keeps_observations = True  # for `known.may_change_observations`
+
     def __init__(
         self, env: gym.Env, angle_index: int, angle_step: float = math.pi / 9, penalise_step: bool = False
     ) -> None:

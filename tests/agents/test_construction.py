@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 from gym_dgpmpc.errors import UnknownRewardError
 from gym_dgpmpc.types import ObservationSpec
-from tests.agents.point_mass import KnownPointMass, PointMass, agent, reward_fn
+from tests.agents.point_mass import KnownPointMass, LinearModel, PointMass, agent, reward_fn
 
 
 def with_spaces(observation=None, action=None):
@@ -28,6 +28,11 @@ def test_discrete_actions_get_the_message_of_sb3():
 def test_unbounded_actions():
     with pytest.raises(ValueError, match=r"finite action bounds, got low = \[-inf\] and high = \[1\.\]"):
         agent(with_spaces(action=spaces.Box(-np.inf, 1.0, (1,), np.float32)))
+
+
+def test_whole_numbers_as_actions():
+    with pytest.raises(ValueError, match=r"must be a Box of floats, got Box\(0, 5, \(1,\), int64\)"):
+        agent(with_spaces(action=spaces.Box(0, 5, (1,), np.int64)))
 
 
 def test_mixed_action_bounds_name_the_ones_that_are_missing():
@@ -67,6 +72,21 @@ def test_one_environment_in_a_vec_env(vec_env_cls):
     learner = agent(env).learn(12)
     env.close()
     assert len(learner.store) == 12
+
+
+def test_a_refused_environment_changes_nothing():
+    learner = agent(dynamics=lambda *sizes: LinearModel())
+    before, dynamics = learner.env, learner.dynamics
+    other = with_spaces(action=spaces.Box(-1.0, 1.0, (2,), np.float32))
+    other.reward_fn = None
+    with pytest.raises(ValueError, match="Action spaces do not match"):
+        learner.set_env(DummyVecEnv([lambda: other]))
+    with pytest.raises(ValueError, match="Action spaces do not match"):
+        learner.set_env(DummyVecEnv([lambda: with_spaces(action=other.action_space)] * 3))
+    assert learner.n_envs == 1
+    assert learner.env is before
+    assert learner.dynamics is dynamics
+    assert not learner.modelled.reward
 
 
 def test_an_unknown_reward_says_what_to_pass():

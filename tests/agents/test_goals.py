@@ -171,6 +171,27 @@ def test_it_goes_to_the_goal():
     assert len(dones) == 5
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"observation": np.zeros(3)},
+        {"observation": None},
+        {"other": np.zeros(2), "observation": None},
+        {"achieved_goal": np.zeros((2, 1))},
+        {"observation": np.zeros(())},
+    ],
+)
+def test_a_dict_of_other_parts_is_named(changed):
+    parts = {"observation": np.zeros(2), "achieved_goal": np.zeros(1), "desired_goal": np.zeros(1)} | changed
+    received = {name: part for name, part in parts.items() if part is not None}
+    expected = (
+        r"a dict of the shapes \{'achieved_goal': \(1,\), 'desired_goal': \(1,\), 'observation': \(2,\)\}, "
+        r"or each with a dimension of n before, got \{"
+    )
+    with pytest.raises(ValueError, match=expected):
+        agent(Goal()).predict(received)
+
+
 def test_sb3s_helpers_take_dicts(tmp_path):
     learner = agent(Goal()).learn(2 * LENGTH)
     action, state = learner.predict(OBSERVATION, deterministic=True)
@@ -181,7 +202,7 @@ def test_sb3s_helpers_take_dicts(tmp_path):
     np.testing.assert_array_equal(actions, [action, action])
     assert state[0].shape[0] == 1 and states[0].shape[0] == 2
     assert len(evaluate_policy(learner, Monitor(Goal()), 2, return_episode_rewards=True)[0]) == 2
-    with pytest.raises(ValueError, match=r"expected an observation of shape \(4,\)"):
+    with pytest.raises(ValueError, match=r"expected a dict of .* got \{'observation': \(2,\)\}"):
         learner.predict({"observation": np.zeros(2)})
     with pytest.raises(EnvironmentDataError, match="not finite"):
         learner.predict({**OBSERVATION, "observation": np.array([np.nan, 0.0])})

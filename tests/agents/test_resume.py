@@ -196,6 +196,28 @@ def test_every_kind_of_generator_is_brought_back(kind):
         set_generator_states(env, states)
 
 
+class FailsToReset(NoisyPointMass):
+    def reset(self, **arguments):
+        raise OSError("the plant is switched off")
+
+
+def test_a_run_that_never_began_leaves_its_folder_free(tmp_path):
+    with pytest.raises(EnvironmentFailedError, match="switched off"):
+        train(tmp_path, FailsToReset())
+    assert not (tmp_path / "agent.zip").exists()
+    assert len(train(tmp_path, resume=False, total=12).store) == 12
+
+
+def test_the_run_of_another_environment_is_refused(tmp_path):
+    def learn(env_id):
+        agent(gymnasium.make(env_id), reward_fn=lambda o, a, n: n[..., 0]).learn(4, run_folder=tmp_path, resume=True)
+
+    learn("ModCartPole-v0")
+    with pytest.raises(CheckpointError, match=r"the environment was ModCartPole-v0, now SwingUpCartPole-v0"):
+        learn("SwingUpCartPole-v0")
+    learn("ModCartPole-v0")
+
+
 def test_another_agents_run_is_refused(tmp_path):
     train(tmp_path, total=12)
     with pytest.raises(CheckpointError, match=r"other settings: num_particles was 5, now 6; seed was 0, now 1"):
@@ -344,6 +366,14 @@ def test_a_full_disk_ends_the_run_and_leaves_the_checkpoint_before(whole, tmp_pa
     assert_same(whole, tmp_path)
 
 
+def steps_on_disk(folder):
+    with RunCheckpoints(folder) as held:
+        checkpoint = held.load()
+    steps = checkpoint.config["counters"]["num_timesteps"]
+    assert len(checkpoint.tensors["transitions"]["reward"]) == steps
+    return steps
+
+
 class SignalAt(BaseCallback):
     def __init__(self, step, number):
         super().__init__()
@@ -356,20 +386,26 @@ class SignalAt(BaseCallback):
 
 
 @pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
-@pytest.mark.parametrize(("env", "saved"), [(NoisyPointMass, 27), (Plant, 20)])
-def test_signals_end_a_run_after_a_checkpoint(tmp_path, number, raised, env, saved):
+def test_signals_end_a_run_after_a_checkpoint(whole, tmp_path, number, raised):
     handlers = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
-    train(tmp_path / "whole", env())
-    learner = agent(env(), tensorboard_log=str(tmp_path / "parts" / "logs"))
+    learner = agent(NoisyPointMass(), actions_per_plan=2, tensorboard_log=str(tmp_path / "logs"))
     with pytest.raises(raised) as stop:
-        learner.learn(TOTAL, SignalAt(27, number), run_folder=tmp_path / "parts", resume=True)
+        learner.learn(TOTAL, SignalAt(27, number), run_folder=tmp_path, resume=True)
     if raised is SystemExit:
         assert stop.value.code == 143
     assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == handlers
-    with RunCheckpoints(tmp_path / "parts") as held:
-        assert held.load().config["counters"]["num_timesteps"] == saved
-    train(tmp_path / "parts", env())
-    assert_same(tmp_path / "whole", tmp_path / "parts")
+    assert steps_on_disk(tmp_path) == 27
+    train(tmp_path, actions_per_plan=2)
+    assert_same(whole, tmp_path)
+
+
+def test_a_signal_costs_no_data_where_the_episode_cannot_be_repeated(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        agent(Plant()).learn(TOTAL, SignalAt(27, signal.SIGINT), run_folder=tmp_path)
+    assert steps_on_disk(tmp_path) == 27
+    learner = train(tmp_path, Plant(), logs=False)
+    assert learner.num_timesteps == len(learner.store) == TOTAL
+    assert learner.store.episodes.tolist()[:30] == [0] * 10 + [1] * 10 + [2] * 7 + [3] * 3
 
 
 def test_a_signal_stops_training_at_once(tmp_path):
@@ -385,8 +421,28 @@ def test_a_signal_stops_training_at_once(tmp_path):
     learner.dynamics.fit = fit_and_signal
     with pytest.raises(SystemExit):
         learner.learn(TOTAL, run_folder=tmp_path)
-    with RunCheckpoints(tmp_path) as held:
-        assert held.load().config["counters"]["num_timesteps"] == 20
+    assert steps_on_disk(tmp_path) == 20
+
+
+@pytest.mark.parametrize("env", [NoisyPointMass, Plant])
+def test_a_signal_in_a_training_within_an_episode_costs_no_data(tmp_path, env):
+    settings = {"learning_starts": 4, "train_freq": 4}
+    learner = agent(env(), tensorboard_log=str(tmp_path / "parts" / "logs"), **settings)
+    fit = learner.dynamics.fit
+
+    def fit_and_signal(data, generator):
+        if len(data.action) == 28:
+            os.kill(os.getpid(), signal.SIGINT)
+        return fit(data, generator)
+
+    learner.dynamics.fit = fit_and_signal
+    with pytest.raises(KeyboardInterrupt):
+        learner.learn(TOTAL, run_folder=tmp_path / "parts")
+    assert steps_on_disk(tmp_path / "parts") == 28
+    assert len(train(tmp_path / "parts", env(), **settings).store) == TOTAL
+    if env.can_replay:
+        train(tmp_path / "whole", env(), **settings)
+        assert_same(tmp_path / "whole", tmp_path / "parts")
 
 
 def test_a_second_signal_stops_at_once(tmp_path):
@@ -400,8 +456,7 @@ def test_a_second_signal_stops_at_once(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         learner.learn(TOTAL, Impatient(), run_folder=tmp_path)
-    with RunCheckpoints(tmp_path) as held:
-        assert held.load().config["counters"]["num_timesteps"] == 0
+    assert steps_on_disk(tmp_path) == 0
 
 
 def test_outside_the_main_thread_there_are_no_signals_to_handle(tmp_path):

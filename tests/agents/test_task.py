@@ -12,6 +12,7 @@ import gym_dgpmpc  # noqa: F401  # registers the environments
 from gym_dgpmpc.agents.task import find_observation_spec, find_task, wrapped_env
 from gym_dgpmpc.envs.known_rewards import PendulumReward
 from gym_dgpmpc.types import ObservationSpec
+from gym_dgpmpc.wrappers import RiskSensitiveReward
 from tests.agents.point_mass import KnownPointMass, PointMass, agent, reward_fn
 
 
@@ -92,6 +93,76 @@ def test_observation_specs_are_looked_for_in_the_same_order():
     assert find_observation_spec(env, given) == given
     assert find_observation_spec(wrapped_env(gym.make("ModCartPole-v0")), None) == ObservationSpec(angles=(1,))
     assert find_observation_spec(wrapped_env(PointMass()), None) == ObservationSpec()
+
+
+class Swapped(gym.ObservationWrapper):
+    def observation(self, observation):
+        return observation[::-1].copy()
+
+
+class Shifted(gym.Wrapper):
+    def step(self, action):
+        observation, *others = super().step(action)
+        return observation + 1, *others
+
+
+class Described(Swapped):
+    """Says itself how to read what it returns."""
+
+    observation_spec = ObservationSpec(angles=(2,))
+
+
+@pytest.mark.parametrize("wrapper", [Swapped, Shifted, lambda env: Monitor(Swapped(env))])
+def test_an_offered_observation_spec_is_not_taken_through_what_may_change_observations(wrapper):
+    env = wrapped_env(wrapper(gym.make("ModCartPole-v0")))
+    with pytest.raises(ValueError, match=r"(Swapped|Shifted) .*may change what its numbers mean.*observation_spec="):
+        find_observation_spec(env, None)
+    given = ObservationSpec(angles=(2,))
+    assert find_observation_spec(env, given) == given
+
+
+def test_an_offered_observation_spec_is_not_taken_through_a_stack_of_frames():
+    env = wrapped_env(VecFrameStack(DummyVecEnv([lambda: gym.make("ModCartPole-v0")]), 2))
+    with pytest.raises(ValueError, match=r"VecFrameStack .*may change what its numbers mean"):
+        find_observation_spec(env, None)
+
+
+@pytest.mark.parametrize(
+    "wrapper",
+    [
+        Monitor,
+        lambda env: RiskSensitiveReward(env, angle_index=1),
+        lambda env: gym.wrappers.RescaleAction(gym.wrappers.TransformReward(env, float), -0.5, 0.5),
+        lambda env: VecNormalize(DummyVecEnv([lambda: gym.wrappers.DtypeObservation(env, np.float32)]), norm_obs=False),
+    ],
+)
+def test_an_offered_observation_spec_is_taken_through_what_keeps_observations(wrapper):
+    env = wrapped_env(wrapper(gym.make("ModCartPole-v0")))
+    assert find_observation_spec(env, None) == ObservationSpec(angles=(1,))
+
+
+def test_a_wrapper_may_say_how_its_own_observations_are_read():
+    env = wrapped_env(Described(gym.make("ModCartPole-v0")))
+    assert find_observation_spec(env, None) == ObservationSpec(angles=(2,))
+
+
+class Closure(KnownPointMass):
+    """Offers what cannot be sent to another process."""
+
+    def __init__(self):
+        super().__init__()
+        self.reward_fn = lambda o, a, n: n[..., 0]
+
+
+def test_a_reward_that_cannot_leave_its_process_is_named():
+    env = SubprocVecEnv([Closure])
+    try:
+        with pytest.raises(ValueError, match=r"attribute 'reward_fn' cannot be sent from the process.*reward_fn="):
+            found(env)
+    finally:
+        for process in env.processes:  # as the worker died, `close` would fail
+            process.join()
+        env.closed = True
 
 
 def test_the_agent_says_it_once(capsys):
