@@ -63,7 +63,6 @@ def main() -> None:
             about = {"agent": path.parent.name, "settings": name} | {key: getattr(agent, key) for key in names}
             rows.append(about | control(agent, env, seeds))
             print(rows[-1], file=sys.stderr, flush=True)
-    # The load is that of before, of which this benchmark's own threads are no part.
     facts: Row = {"command": command("real_time"), "threads": arguments.threads, "load_average_1_min_before": load}
     facts |= {"machine": machine(), "versions": versions(), "rows": rows}
     replace_text(arguments.results / "real_time.json", json.dumps(facts, indent=1) + "\n")

@@ -16,7 +16,7 @@ from gym_dgpmpc.bench import markdown
 Row = dict[str, Any]
 
 ABOUT = ("command", "torch")
-"""What each row says of its making. Not in the table's columns, and no other of it makes a measurement another one."""
+"""What each row says of its making: no column of the table, and no reason to measure again."""
 
 
 def find(rows: Sequence[Row], **wanted: Any) -> Row | None:
