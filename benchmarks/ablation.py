@@ -3,11 +3,10 @@
 Every variant learns from the same episode of random actions and then plans the first steps of an episode, so that a
 variant costs a few minutes. Beside the return it says what the plans expected and what was obtained (a planner that
 exploits errors of its model expects more), and how well the model predicts H steps ahead under smoother random actions.
-Writes `ablation.md` and `ablation.json`; what is in the latter already is not done again.
+Writes `ablation.md` and `ablation.json`; what is in the latter already, with the same settings, is not done again.
 """
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -17,7 +16,8 @@ import gymnasium
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
-from benchmarks.calibration import random_episode, score, write_rows
+from benchmarks.calibration import random_episode, score
+from benchmarks.rows import Row, measure_missing
 from gym_dgpmpc import DGPMPCAgent
 from gym_dgpmpc.agents.presets import PAPER
 
@@ -34,6 +34,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 """Arguments of `DGPMPCAgent` that differ from the paper's settings for the task."""
 
+SETTINGS = argparse.ArgumentParser(add_help=False)
+SETTINGS.add_argument(
+    "--env", dest="environment", metavar="ENV_ID", default="RiskSensitiveHalfCheetah-v0", help="id of the environment"
+)
+SETTINGS.add_argument("--steps", type=int, default=200, help="planned steps")
+
 HORIZONS, TEST_SEEDS = (1, 10, 20, 40), range(5000, 5003)
 
 
@@ -47,23 +53,25 @@ class _OneEpisode(BaseCallback):
         self.values = dict(self.logger.name_to_value)
 
 
-def measure(variant: str, seed: int, arguments: argparse.Namespace) -> dict[str, Any]:
+def measure(wanted: Row) -> Row:
     """One model on one random episode, and the first steps it plans."""
-    source = gymnasium.make(arguments.env)
+    env_id, steps, variant, seed = (wanted[name] for name in ("environment", "steps", "variant", "seed"))
+    source = gymnasium.make(env_id)
     data = random_episode(source, seed, 0.0)
-    env = gymnasium.make(arguments.env, max_episode_steps=arguments.steps)
-    agent = DGPMPCAgent(env, seed=seed, **{**PAPER.get(arguments.env, {}), **VARIANTS[variant]})
+    env = gymnasium.make(env_id, max_episode_steps=steps)
+    agent = DGPMPCAgent(env, seed=seed, **{**PAPER.get(env_id, {}), **VARIANTS[variant]})
+    assert agent.task.reward_fn is not None
     columns = {name: value.numpy() for name, value in data._asdict().items()}
     agent.add_transitions({**columns, "reward": agent.task.reward_fn(*data).numpy()})
     agent.learn(0)
-    row: dict[str, Any] = {"variant": variant, "seed": seed}
+    row: Row = {}
     tests = [random_episode(source, test_seed, 0.8) for test_seed in TEST_SEEDS]
     spread = torch.cat([test.next_observation for test in tests]).std(0)
     for horizon in HORIZONS:
         scores = score(agent.dynamics, tests, horizon, torch.Generator().manual_seed(seed), spread=spread)
         row |= {f"{name}_{horizon}": scores[name] for name in ("error", "coverage_90")}
     started, kept = time.process_time(), _OneEpisode()
-    agent.learn(arguments.steps, kept, log_interval=sys.maxsize)
+    agent.learn(steps, kept, log_interval=sys.maxsize)
     row["return"] = kept.values["rollout/ep_return"]
     for name in ("predicted", "obtained"):
         row[name] = kept.values[f"planner/{name}_reward_per_step"]
@@ -71,23 +79,18 @@ def measure(variant: str, seed: int, arguments: argparse.Namespace) -> dict[str,
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.ablation", description=__doc__)
-    parser.add_argument("--env", default="RiskSensitiveHalfCheetah-v0", help="id of the environment")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.ablation", description=__doc__, parents=[SETTINGS])
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS), metavar="VARIANT")
     parser.add_argument("--seeds", nargs="+", type=int, default=[100, 101])
-    parser.add_argument("--steps", type=int, default=200, help="planned steps")
     parser.add_argument("--results", type=Path, default=Path("benchmarks/results/ablation"))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    saved = arguments.results / "ablation.json"
-    rows = json.loads(saved.read_text())["rows"] if saved.exists() else []
-    done = {(row["variant"], row["seed"]) for row in rows}
+    settings = {"environment": arguments.environment, "steps": arguments.steps}
     # Seeds outermost, so that an interrupted benchmark has every variant with some seeds.
-    for seed, variant in ((seed, variant) for seed in arguments.seeds for variant in arguments.variants):
-        if (variant, seed) not in done:
-            rows.append(measure(variant, seed, arguments))
-            write_rows(rows, "ablation", arguments.env, arguments.results)
-    print((arguments.results / "ablation.md").read_text())
+    wanted = [
+        settings | {"variant": variant, "seed": seed} for seed in arguments.seeds for variant in arguments.variants
+    ]
+    print(measure_missing("ablation", arguments.results, wanted, measure, SETTINGS))
 
 
 if __name__ == "__main__":

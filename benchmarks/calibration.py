@@ -1,12 +1,11 @@
 """How well a model trained on one random episode knows what it does not know: `python -m benchmarks.calibration`.
 
 Trains on the modified cart-pole in several ways, and tests H-step predictions on episodes of smoother random actions,
-which go elsewhere. Writes `calibration.md` and `calibration.json`; what is in the latter already is not done again.
+which go elsewhere. Writes `calibration.md` and `calibration.json`; what is in the latter already, with the same
+settings, is not done again.
 """
 
 import argparse
-import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.rows import Row, measure_missing
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
 from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.types import DynamicsModel, Transitions
@@ -32,12 +32,17 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 """Ways of training, as arguments of `DeepGPDynamics` or `InferenceSettings`."""
 
+SETTINGS = argparse.ArgumentParser(add_help=False)
+SETTINGS.add_argument("--layers", type=int, default=2)
+SETTINGS.add_argument("--kernel", default="matern32")
+
 ENVIRONMENT, TEST_SEEDS, NUM_PARTICLES, NORMAL_90 = "ModCartPole-v0", range(5000, 5004), 100, 1.645
 
 
 def random_episode(env: gymnasium.Env, seed: int, smoothing: float) -> Transitions:
     """An episode under actions that are uniform (``smoothing`` 0) or follow a bounded autoregression."""
     rng, rows = np.random.default_rng(seed), []
+    assert isinstance(env.action_space, gymnasium.spaces.Box)
     low, high = env.action_space.low, env.action_space.high
     observation, _ = env.reset(seed=seed)
     level, done = (low + high) / 2, False
@@ -83,19 +88,19 @@ def score(
     }
 
 
-def measure(variant: str, seed: int, arguments: argparse.Namespace) -> dict[str, Any]:
+def measure(wanted: Row) -> Row:
     """One model on one random episode."""
+    variant, seed = VARIANTS[wanted["variant"]], wanted["seed"]
     env, generator = gymnasium.make(ENVIRONMENT), torch.Generator().manual_seed(seed)
-    inference = {key: value for key, value in VARIANTS[variant].items() if key in InferenceSettings.__annotations__}
-    settings = {key: value for key, value in VARIANTS[variant].items() if key not in inference}
+    inference = {key: value for key, value in variant.items() if key in InferenceSettings.__annotations__}
+    settings = {key: value for key, value in variant.items() if key not in inference}
     model = DeepGPDynamics(
-        4, 1, env.get_wrapper_attr("observation_spec"), num_layers=arguments.layers, kernel=arguments.kernel,
+        4, 1, env.get_wrapper_attr("observation_spec"), num_layers=wanted["layers"], kernel=wanted["kernel"],
         inference=InferenceSettings(**inference), **settings,
     )  # fmt: skip
     started = time.process_time()
     metrics = model.fit(random_episode(env, seed, 0.0), generator)
-    row = {"variant": variant, "seed": seed, "cpu_seconds": time.process_time() - started}
-    row["iterations"] = metrics["iterations"]
+    row = {"cpu_seconds": time.process_time() - started, "iterations": metrics["iterations"]}
     tests = [random_episode(env, test_seed, 0.8) for test_seed in TEST_SEEDS]
     for horizon in (1, 15):
         scores = score(model, tests, horizon, generator)
@@ -104,38 +109,14 @@ def measure(variant: str, seed: int, arguments: argparse.Namespace) -> dict[str,
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.calibration", description=__doc__)
-    parser.add_argument("--layers", type=int, default=2)
-    parser.add_argument("--kernel", default="matern32")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.calibration", description=__doc__, parents=[SETTINGS])
     parser.add_argument("--seeds", nargs="+", type=int, default=[100, 101])
     parser.add_argument("--results", type=Path, default=Path("benchmarks/results/calibration"))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    saved = arguments.results / "calibration.json"
-    rows = json.loads(saved.read_text())["rows"] if saved.exists() else []
-    done = {(row.get("variant"), row["seed"]) for row in rows}
-    wanted = [(variant, seed) for variant in VARIANTS for seed in arguments.seeds]
-    for setting in wanted:
-        if setting not in done:
-            rows.append(measure(*setting, arguments))
-            write_rows(rows, "calibration", ENVIRONMENT, arguments.results)
-    print((arguments.results / "calibration.md").read_text())
-
-
-def write_rows(rows: list[dict[str, Any]], name: str, environment: str, results: Path) -> None:
-    """All rows so far, raw and as a table, of the benchmark of that name."""
-    results.mkdir(parents=True, exist_ok=True)
-    command = f"python -m benchmarks.{name} {' '.join(sys.argv[1:])}".strip()
-    facts = {"command": command, "environment": environment, "torch": torch.__version__, "rows": rows}
-    (results / f"{name}.json").write_text(json.dumps(facts, indent=2) + "\n")
-    names = list(rows[0])
-    lines = [f"Made by `{command}`.", "", f"| {' | '.join(names)} |", "|" + "---|" * len(names)]
-    lines += ["| " + " | ".join(_cell(row[name]) for name in names) + " |" for row in rows]
-    (results / f"{name}.md").write_text("\n".join(lines) + "\n")
-
-
-def _cell(value: Any) -> str:
-    return f"{value:.2f}" if isinstance(value, float) and value != int(value) else str(value)
+    settings = {"layers": arguments.layers, "kernel": arguments.kernel}
+    wanted = [settings | {"variant": variant, "seed": seed} for variant in VARIANTS for seed in arguments.seeds]
+    print(measure_missing("calibration", arguments.results, wanted, measure, SETTINGS))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ Controls the environment that the agent was trained in with its own planning set
 import argparse
 import json
 import os
-import platform
 import sys
 import time
 from pathlib import Path
@@ -18,8 +17,12 @@ import gymnasium
 import numpy as np
 import torch
 
+from benchmarks.rows import Row, command
 from gym_dgpmpc import DGPMPCAgent
+from gym_dgpmpc.agents.files import replace_text
 from gym_dgpmpc.agents.presets import REAL_TIME
+from gym_dgpmpc.bench import markdown
+from gym_dgpmpc.reporting.circumstances import machine, versions
 
 
 def control(agent: DGPMPCAgent, env: gymnasium.Env, seeds: range) -> dict[str, Any]:
@@ -49,40 +52,39 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=Path("benchmarks/results/speed"))
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    env, rows, load = gymnasium.make(arguments.env), [], os.getloadavg()[0]
+    env, load = gymnasium.make(arguments.env), os.getloadavg()[0]
+    rows: list[Row] = []
     seeds = range(7000, 7000 + arguments.episodes)
+    planning: dict[str, dict[str, Any]] = {"as trained": {}, "REAL_TIME": dict(REAL_TIME[arguments.env])}
     for path in arguments.agent:
-        for name, settings in (("as trained", {}), ("REAL_TIME", dict(REAL_TIME[arguments.env]))):
+        for name, settings in planning.items():
             agent = DGPMPCAgent.load(path, env=env, **settings)
             names = ("num_layers", "num_candidates", "num_iterations", "horizon", "num_particles")
             about = {"agent": path.parent.name, "settings": name} | {key: getattr(agent, key) for key in names}
             rows.append(about | control(agent, env, seeds))
             print(rows[-1], file=sys.stderr, flush=True)
-    facts = {
-        "command": f"python -m benchmarks.real_time {' '.join(sys.argv[1:])}",
-        "threads": arguments.threads,
-        "load_average_1_min_before": load,
-        "versions": {"python": platform.python_version(), "torch": torch.__version__},
-        "rows": rows,
-    }
-    arguments.results.mkdir(parents=True, exist_ok=True)
-    (arguments.results / "real_time.json").write_text(json.dumps(facts, indent=1) + "\n")
-    lines = [
+    facts: Row = {"command": command("real_time"), "threads": arguments.threads, "load_average_1_min_before": load}
+    facts |= {"machine": machine(), "versions": versions(), "rows": rows}
+    replace_text(arguments.results / "real_time.json", json.dumps(facts, indent=1) + "\n")
+    head = (
         f"Made by `{facts['command']}`; {arguments.threads} thread(s), {arguments.episodes} episodes each from the "
-        "same starting states. One step of the environment is "
-        f"{1e3 * env.unwrapped.dt:.0f} ms.",
-        "",
-        "| agent | L | settings | K | iterations | p50 ms | p95 ms | p99 ms | mean return | std |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+        f"same starting states. One step of the environment is {1e3 * env.get_wrapper_attr('dt'):.0f} ms."
+    )
+    text = "\n".join([head, "", *table(rows)]) + "\n"
+    replace_text(arguments.results / "real_time.md", text)
+    print(text)
+
+
+def table(rows: list[Row]) -> list[str]:
+    """Each agent with each of its settings in Markdown."""
+    header = ["agent", "L", "settings", "K", "iterations", "p50 ms", "p95 ms", "p99 ms", "mean return", "std"]
+    cells = []
     for row in rows:
-        lines.append(
-            f"| {row['agent']} | {row['num_layers']} | {row['settings']} | {row['num_candidates']} "
-            f"| {row['num_iterations']} | {row['p50_ms']:.1f} | {row['p95_ms']:.1f} | {row['p99_ms']:.1f} "
-            f"| {np.mean(row['returns']):.1f} | {np.std(row['returns'], ddof=1):.1f} |"
-        )
-    (arguments.results / "real_time.md").write_text("\n".join(lines) + "\n")
-    print("\n".join(lines))
+        names = ("agent", "num_layers", "settings", "num_candidates", "num_iterations")
+        numbers = [*(row[f"{name}_ms"] for name in ("p50", "p95", "p99")), np.mean(row["returns"])]
+        spread = f"{np.std(row['returns'], ddof=1):.1f}" if len(row["returns"]) > 1 else markdown.NOTHING
+        cells.append([*(markdown.cell(str(row[name])) for name in names), *(f"{x:.1f}" for x in numbers), spread])
+    return markdown.table(header, cells)
 
 
 if __name__ == "__main__":

@@ -91,6 +91,16 @@ def test_train_and_evaluate(run, tmp_path, drawable):
     assert run("evaluate", "a/agent.zip", "--episodes", 2).stdout.splitlines()[:3] == result.stdout.splitlines()[:3]
 
 
+def test_the_seed_of_an_evaluation_decides_its_starting_states(run):
+    assert run("train", ENV_ID, *SMALLEST, "--no-video", "--episodes", 1, "--out", "a").exit_code == 0
+    played = [run("evaluate", "a", "--episodes", 2, "--seed", seed) for seed in (1, 2, 1)]
+    assert all(result.exit_code == 0 for result in played)
+    first, second, again = (re.findall(r"return +(\S+)$", result.stdout, re.MULTILINE)[:2] for result in played)
+    assert len(first) == 2
+    assert first == again
+    assert set(first).isdisjoint(second)
+
+
 def test_the_same_command_goes_on_or_says_that_it_is_done(run):
     command = ("train", ENV_ID, *SMALLEST, "--no-video", "--out", "a")
     assert run(*command, "--episodes", 1).exit_code == 0

@@ -8,7 +8,6 @@ idle machine.
 import argparse
 import json
 import os
-import platform
 import subprocess
 import sys
 from itertools import product
@@ -16,17 +15,13 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.rows import command
 from benchmarks.speed.cases import CASES
 from benchmarks.speed.measure import WORKERS
 from benchmarks.speed.report import document
+from gym_dgpmpc.agents.files import replace_text
 from gym_dgpmpc.dynamics import compiled_rollout
-
-
-def processor() -> str:
-    """The processor's name, where the system tells it."""
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.processor())
+from gym_dgpmpc.reporting.circumstances import processor, versions
 
 
 def work(arguments: argparse.Namespace) -> None:
@@ -65,27 +60,26 @@ def main() -> None:
         # More threads are compared where most is to be done.
         if not wanted.get(part, threads == first or layers == deepest):
             continue
-        command = [
+        worker = [
             sys.executable, "-m", "benchmarks.speed", "--worker", part, "--cases", name, "--layers", str(layers),
             "--threads", str(threads), "--repeats", str(arguments.repeats),
         ]  # fmt: skip
         environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
-        output = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
+        output = subprocess.run(worker, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
         rows += [json.loads(line) for line in output.splitlines() if line.startswith("{")]
         print(f"{name}, L = {layers}, {threads} thread(s): {part}", file=sys.stderr, flush=True)
     facts = {
-        "command": f"python -m benchmarks.speed {' '.join(sys.argv[1:])}".strip(),
+        "command": command("speed"),
         "processor": processor(),
         "cores": os.cpu_count(),
         "load_average_1_min_before": load,
         "load_average_1_min_after": os.getloadavg()[0],
         "compiled": compiled_rollout.is_available(),
-        "versions": {"python": platform.python_version(), "torch": torch.__version__},
+        "versions": versions(),
     }
-    arguments.results.mkdir(parents=True, exist_ok=True)
-    (arguments.results / "speed.json").write_text(json.dumps(facts | {"rows": rows}, indent=1) + "\n")
+    replace_text(arguments.results / "speed.json", json.dumps(facts | {"rows": rows}, indent=1) + "\n")
     text = document(facts, rows)
-    (arguments.results / "speed.md").write_text(text)
+    replace_text(arguments.results / "speed.md", text)
     print(text)
 
 

@@ -5,10 +5,14 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import torch
+from gymnasium.spaces import Box
 from torch import Tensor
 
+import gym_dgpmpc  # noqa: F401  # registers the environments
+from gym_dgpmpc.agents.presets import PAPER
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
 from gym_dgpmpc.planning.cem import CEM
 from gym_dgpmpc.planning.rollout import rollout_objective
@@ -30,10 +34,19 @@ class Case(NamedTuple):
     """Layers and width of PETS's networks."""
 
 
+def case(name: str, env_id: str, hidden: tuple[int, int]) -> Case:
+    """The sizes that agents meet in the environment, with the paper's settings for it."""
+    env, settings = gymnasium.make(env_id), PAPER[env_id]
+    assert isinstance(env.observation_space, Box) and isinstance(env.action_space, Box)
+    sizes = env.observation_space.shape[0], env.action_space.shape[0]
+    spec = env.get_wrapper_attr("observation_spec")
+    return Case(name, *sizes, spec, settings["horizon"], settings["num_iterations"], hidden)
+
+
 CASES = (
-    Case("cart-pole", 4, 1, ObservationSpec(angles=(1,)), 30, 5, (3, 500)),
-    Case("reacher", 17, 7, ObservationSpec(constant=(7, 8, 9)), 20, 5, (4, 200)),
-    Case("half-cheetah", 18, 6, ObservationSpec(angles=(2,), absolute=(0,), not_inputs=(0,)), 40, 10, (4, 200)),
+    case("cart-pole", "ModCartPole-v0", (3, 500)),
+    case("reacher", "BiasedReacher-v0", (4, 200)),
+    case("half-cheetah", "RiskSensitiveHalfCheetah-v0", (4, 200)),
 )
 
 DRAWS: Mapping[str, dict[str, Any]] = {

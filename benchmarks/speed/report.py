@@ -2,7 +2,8 @@
 
 from typing import Any
 
-Row = dict[str, Any]
+from benchmarks.rows import Row, find
+from gym_dgpmpc.bench import markdown
 
 EXTRA = (
     "varied", "value", "extra_memory_mb", "seconds_to_compile", "product_gflops", "large_product_gflops", "by",
@@ -10,23 +11,13 @@ EXTRA = (
 """What some rows have besides their times."""
 
 
-def find(rows: list[Row], **wanted: Any) -> Row | None:
-    """The first row with these values."""
-    return next((row for row in rows if all(row.get(key) == value for key, value in wanted.items())), None)
-
-
-def table(header: list[str], lines: list[list[str]]) -> str:
-    """A Markdown table."""
-    return "\n".join([f"| {' | '.join(line)} |" for line in [header, ["---"] * len(header), *lines]]) + "\n"
-
-
 def ratio(rows: list[Row], slow: Row, fast: Row) -> str:
     """How many times longer the median of one row is than that of another."""
     above, below = find(rows, **slow), find(rows, **fast)
-    return f"{above['p50_ms'] / below['p50_ms']:.1f}" if above and below else "–"
+    return f"{above['p50_ms'] / below['p50_ms']:.1f}" if above and below else markdown.NOTHING
 
 
-def ratios(rows: list[Row]) -> str:
+def ratios(rows: list[Row]) -> list[str]:
     """The comparisons of the issue of speed, per case, threads and refresh, at the largest number of layers."""
     lines = []
     keys = sorted({(r["threads"], r["case"]) for r in rows if r.get("case") and r["worker"] == "plans"})
@@ -50,10 +41,10 @@ def ratios(rows: list[Row]) -> str:
         "task", "L", "refresh", "threads", "`joint` / plan", "PETS / plan", "PETS in bfloat16 / plan",
         "GPyTorch / rollout step", "GPyTorch / training iteration", "plan / bare arithmetic in PyTorch",
     ]  # fmt: skip
-    return table(header, lines)
+    return markdown.table(header, lines)
 
 
-def times(rows: list[Row], worker: str) -> str:
+def times(rows: list[Row], worker: str) -> list[str]:
     """All times of one worker."""
     extra = [key for key in EXTRA if any(key in row for row in rows if row["worker"] == worker)]
     lines = []
@@ -63,7 +54,7 @@ def times(rows: list[Row], worker: str) -> str:
         cells = [row["case"], str(row["threads"]), row["what"], _cell(row.get("L")), _cell(row.get("how"))]
         cells += [_cell(row["p50_ms"]), _cell(row.get("p95_ms")), *(_cell(row.get(key)) for key in extra)]
         lines.append(cells)
-    return table(["task", "threads", "what", "L", "how", "p50 ms", "p95 ms", *extra], lines)
+    return markdown.table(["task", "threads", "what", "L", "how", "p50 ms", "p95 ms", *extra], lines)
 
 
 def _cell(value: Any) -> str:
@@ -89,7 +80,8 @@ def document(facts: Row, rows: list[Row]) -> str:
         "How many times longer the others take, by medians (the last column: this package's plan in units of the bare "
         "products, square roots, exponentials and cosines in PyTorch):",
         "",
-        ratios(rows),
+        *ratios(rows),
+        "",
     ]
     titles = {
         "plans": "Plans and rollout steps",
@@ -101,5 +93,5 @@ def document(facts: Row, rows: list[Row]) -> str:
     }
     for worker, title in titles.items():
         if any(row["worker"] == worker for row in rows):
-            text += [f"## {title}", "", times(rows, worker)]
+            text += [f"## {title}", "", *times(rows, worker), ""]
     return "\n".join(text)

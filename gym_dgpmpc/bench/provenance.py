@@ -9,6 +9,7 @@ from typing import NamedTuple
 from gym_dgpmpc.bench.markdown import NOTHING, cell, table
 from gym_dgpmpc.bench.results import RunResult
 from gym_dgpmpc.bench.scores import Runs
+from gym_dgpmpc.reporting.circumstances import OPTIONAL
 
 SECTION = "What the runs were made with"
 
@@ -96,10 +97,15 @@ def _seeds_of_task(runs: Runs) -> str:
 
 
 def _differing(origins: list[Origin]) -> str:
-    """What is not the same in all of them: "revision, numpy (2.2.6, 2.4.6)"."""
+    """What is not the same in all of them: "revision, numpy (2.2.6, 2.4.6)".
+
+    An optional package that some do not name is none of it: it was not installed, or the file is older than the naming.
+    """
     found = ["revisions"] if len({origin.revision for origin in origins}) > 1 else []
     for package in sorted({name for origin in origins for name, _ in origin.versions}):
         versions = sorted({dict(origin.versions).get(package, "none") for origin in origins})
+        if package in OPTIONAL and "none" in versions:
+            versions.remove("none")
         found += [f"{package} ({', '.join(versions)})"] if len(versions) > 1 else []
     return ", ".join(found)
 

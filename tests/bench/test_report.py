@@ -91,6 +91,17 @@ def test_differing_versions_are_named():
     assert "All runs have the same revision and versions." in alike.lines()
 
 
+def test_a_missing_optional_package_makes_no_difference():
+    """Older files do not name any."""
+    versions = [{"numpy": "2.0"}, {"numpy": "2.0", "ray": "2.60"}, {"numpy": "2.0", "ray": "2.61"}]
+    first, second, third = (run(name, [1.0], versions=found) for name, found in zip("ABC", versions, strict=True))
+    origins = Origins(grouped(first, second))
+    assert "All runs have the same revision and versions." in origins.lines()
+    assert "**" not in origins.caption(grouped(first, second))
+    assert any(line.startswith("| B | 1 |") and "| ray 2.60 |" in line for line in origins.lines())
+    assert "Not the same in all runs: ray (2.60, 2.61)." in Origins(grouped(first, second, third)).lines()
+
+
 def test_methods_with_the_same_other_seeds_are_told_together():
     runs = {name: [run(name, [1.0], seed=seed) for seed in seeds]
             for name, seeds in {"A": [0, 1], "B": [0], "C": [0, 1], "D": [2], "E": [0]}.items()}  # fmt: skip

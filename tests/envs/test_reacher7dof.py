@@ -25,6 +25,29 @@ def capsule(radius, length):
     return ball(radius) + 1000 * np.pi * radius**2 * length
 
 
+def inertia_about_the_middle(radius, start, end):
+    """Of a capsule: a cylinder from start to end and half a ball at either end."""
+    way = np.subtract(end, start)
+    length = np.linalg.norm(way)
+    balls, cylinder = ball(radius), capsule(radius, length) - ball(radius)
+    along = cylinder * radius**2 / 2 + balls * 2 / 5 * radius**2
+    across = cylinder * (radius**2 / 4 + length**2 / 12)
+    across += balls * (2 / 5 * radius**2 + length**2 / 4 + 3 / 8 * length * radius)
+    direction = way / (length or 1.0)
+    return across * np.eye(3) + (along - across) * np.outer(direction, direction)
+
+
+def centre_and_inertia(capsules):
+    """Of a body's capsules together: the centre of mass (3,), and the inertia (3, 3) about it in the body's axes."""
+    middles = np.array([np.add(start, end) / 2 for _, start, end in capsules])
+    masses = np.array([capsule(radius, np.linalg.norm(np.subtract(end, start))) for radius, start, end in capsules])
+    centre = masses @ middles / masses.sum()
+    inertia = sum(inertia_about_the_middle(*shape) for shape in capsules)
+    for mass, offset in zip(masses, middles - centre, strict=True):
+        inertia = inertia + mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+    return centre, inertia
+
+
 def targets(env, resets):
     """The target after each reset, with one step before the next."""
     found = []
@@ -63,6 +86,39 @@ def test_masses():
     published = [24.31, 10.47, 0.285, 5.43, 1.36, 0.285, 3.04, 0.017, 0.017, 0.838, 0.033, 0.033, 0.033, 0.033]
     np.testing.assert_allclose(model.body_mass[2:], published, atol=6e-3)
     assert model.body_mass.sum() == pytest.approx(46.19, abs=5e-3)
+
+
+def test_where_each_link_has_its_mass():
+    """Every body is capsules between two points of its own frame; an eye is one between a point and itself."""
+    eyes = [(0.05, (x, 0.05, 0.2), (x, 0.05, 0.2)) for x in (0.06, -0.06)]
+    pupils = [(0.03, (x, 0.09, 0.2), (x, 0.09, 0.2)) for x in (0.06, -0.06)]
+    links = {
+        "shoulder_pan": [(0.1, (0, 0, -0.4), (0, 0, 0.2)), *eyes, *pupils],
+        "shoulder_lift": [(0.1, (0, -0.1, 0), (0, 0.1, 0))],
+        "upper_arm_roll": [(0.02, (-0.1, 0, 0), (0.1, 0, 0))],
+        "upper_arm": [(0.06, (0, 0, 0), (0.4, 0, 0))],
+        "elbow": [(0.06, (0, -0.02, 0), (0, 0.02, 0))],
+        "forearm_roll": [(0.02, (-0.1, 0, 0), (0.1, 0, 0))],
+        "forearm": [(0.05, (0, 0, 0), (0.321, 0, 0))],
+        "wrist_flex": [(0.01, (0, -0.02, 0), (0, 0.02, 0))],
+        "wrist_roll": [(0.01, (-0.02, 0, 0), (0.02, 0, 0))],
+        "palm": [(0.05, (0.05, 0, -0.02), (0.05, 0, 0.02))],
+        "left_finger": [(0.01, (0, 0, 0), (0.09137, 0.00495, 0))],
+        "left_fingertip": [(0.01, (0, 0, 0), (0.09137, 0, 0))],
+        "right_finger": [(0.01, (0, 0, 0), (0.09137, -0.00495, 0))],
+        "right_fingertip": [(0.01, (0, 0, 0), (0.09137, 0, 0))],
+    }
+    model = Reacher7DoFEnv().model
+    assert links.keys() == {model.body(i).name for i in range(model.nbody)} - {"world", "target"}
+    for name, capsules in links.items():
+        body = model.body(name)
+        centre, inertia = centre_and_inertia(capsules)
+        axes = np.zeros(9)
+        mujoco.mju_quat2Mat(axes, body.iquat)
+        axes = axes.reshape(3, 3)
+        np.testing.assert_allclose(body.ipos, centre, rtol=0, atol=1e-12, err_msg=name)
+        found = axes @ np.diag(body.inertia) @ axes.T
+        np.testing.assert_allclose(found, inertia, rtol=0, atol=1e-9 * np.trace(inertia), err_msg=name)
 
 
 def test_joints_and_simulation():

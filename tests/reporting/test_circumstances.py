@@ -1,12 +1,14 @@
 """What results say of the code that made them is true."""
 
+import importlib.metadata
+import platform
 import shutil
 import subprocess
 
 import pytest
 
 from gym_dgpmpc.reporting import circumstances
-from gym_dgpmpc.reporting.circumstances import UNKNOWN, machine, revision, versions
+from gym_dgpmpc.reporting.circumstances import UNKNOWN, machine, processor, revision, versions
 
 
 @pytest.fixture
@@ -60,5 +62,33 @@ def test_without_a_repository_or_git(tmp_path, monkeypatch):
 
 
 def test_versions_and_machine():
-    assert set(versions()) == {"python", *circumstances.PACKAGES}
+    assert {"python", *circumstances.PACKAGES} <= versions().keys()
+    assert versions().keys() <= {"python", *circumstances.PACKAGES, *circumstances.OPTIONAL}
     assert machine()["threads"] == 1
+    assert machine()["processor"] == processor()
+
+
+def test_optional_packages_are_told_where_they_are(monkeypatch):
+    def version(name):
+        if name in circumstances.OPTIONAL and name != "ray":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return "1.2"
+
+    monkeypatch.setattr(circumstances.importlib.metadata, "version", version)
+    assert versions() == {"python": platform.python_version(), **dict.fromkeys([*circumstances.PACKAGES, "ray"], "1.2")}
+
+
+def test_the_processor_by_its_name(tmp_path):
+    cpuinfo = tmp_path / "cpuinfo"
+    cpuinfo.write_text("processor\t: 0\nmodel name\t: Some CPU: 9 @ 2 GHz\nprocessor\t: 1\nmodel name\t: Other\n")
+    assert processor(cpuinfo) == "Some CPU: 9 @ 2 GHz"
+
+
+def test_the_processor_where_the_system_does_not_tell_its_name(tmp_path, monkeypatch):
+    cpuinfo = tmp_path / "cpuinfo"  # as on ARM
+    cpuinfo.write_text("processor\t: 0\nCPU part\t: 0xd0c\n")
+    monkeypatch.setattr(platform, "processor", lambda: "")
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    assert processor(cpuinfo) == processor(tmp_path / "none") == "aarch64"
+    monkeypatch.setattr(platform, "processor", lambda: "a name")
+    assert processor(tmp_path / "none") == "a name"

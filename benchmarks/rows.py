@@ -1,0 +1,84 @@
+"""The rows of a benchmark that may be interrupted, one per measurement: what is in its files is not measured again."""
+
+import argparse
+import json
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gym_dgpmpc.agents.files import replace_text
+from gym_dgpmpc.bench import markdown
+
+Row = dict[str, Any]
+
+ABOUT = ("command", "torch")
+"""What each row says of its making: no column of the table, and no reason to measure again."""
+
+
+def find(rows: Sequence[Row], **wanted: Any) -> Row | None:
+    """The first row with these values."""
+    return next((row for row in rows if all(row.get(key) == value for key, value in wanted.items())), None)
+
+
+def command(name: str) -> str:
+    """The command that is running, which is that of the benchmark of that name."""
+    return shlex.join(["python", "-m", f"benchmarks.{name}", *sys.argv[1:]])
+
+
+def measure_missing(
+    name: str,
+    results: Path,
+    wanted: Sequence[Row],
+    measure: Callable[[Row], Row],
+    settings: argparse.ArgumentParser,
+) -> str:
+    """Measure what the benchmark's files do not have, and write them anew after each measurement.
+
+    Args:
+        name: of the benchmark and of its files, ``name.json`` and ``name.md``.
+        results: their folder.
+        wanted: for each measurement everything that makes it another one.
+        measure: gives the results of one.
+        settings: has the options that are part of each of ``wanted``; for files whose rows do not name them.
+
+    Returns:
+        The table of all rows, those of other settings included.
+    """
+    file = results / f"{name}.json"
+    rows = read_rows(file, settings)
+    for row in wanted:
+        if find(rows, **row) is None:
+            rows.append(row | measure(row) | {"command": command(name), "torch": torch.__version__})
+            replace_text(file, json.dumps({"rows": rows}, indent=2) + "\n")
+            replace_text(results / f"{name}.md", document(rows))
+    return document(rows)
+
+
+def read_rows(file: Path, settings: argparse.ArgumentParser) -> list[Row]:
+    """The rows of a file, none if there is no file.
+
+    Rows used not to name their settings; they have those that the command of the whole file says.
+    """
+    if not file.exists():
+        return []
+    facts = json.loads(file.read_text())
+    if "command" not in facts:
+        return facts["rows"]
+    made_with = vars(settings.parse_known_args(facts["command"].split())[0])
+    return [made_with | row | {key: facts[key] for key in ABOUT} for row in facts["rows"]]
+
+
+def document(rows: Sequence[Row]) -> str:
+    """All rows as a table, with the commands that made them."""
+    commands = dict.fromkeys(f"`{row['command']}`" for row in rows)
+    names = [name for name in dict.fromkeys(name for row in rows for name in row) if name not in ABOUT]
+    cells = [[_cell(row.get(name, markdown.NOTHING)) for name in names] for row in rows]
+    return "\n".join([f"Made by {', '.join(commands)}.", "", *markdown.table(names, cells)]) + "\n"
+
+
+def _cell(value: Any) -> str:
+    return markdown.cell(f"{value:.2f}" if isinstance(value, float) and not value.is_integer() else str(value))
