@@ -27,6 +27,10 @@ from gym_dgpmpc.errors import EnvironmentDataError
 SelfAgent = TypeVar("SelfAgent", bound="MPCAgent")
 
 
+ENDLESS = 1000
+"""Random steps after which it is told that no episode has ended. Gymnasium's own tasks have at most as many."""
+
+
 class MPCAgent(ActingAgent):
     """Learns a dynamics model from its own experience and acts by planning through it.
 
@@ -178,6 +182,7 @@ class MPCAgent(ActingAgent):
             # Sample K action sequences and P trajectories of each, update m and v by their returns, repeat.
             observations = self._observations
             if self.is_exploring:
+                self._warn_of_an_endless_beginning()
                 actions = np.stack([self.planning.uniform(self.generators.exploration) for _ in self._running])
             else:
                 actions = self._plan(observations)
@@ -201,6 +206,15 @@ class MPCAgent(ActingAgent):
             if not goes_on:
                 return
         self._fit_if_due()
+
+    def _warn_of_an_endless_beginning(self) -> None:
+        has_ended = any(running.has_explored for running in self._running)
+        if self.learning_starts is None and len(self.store) == ENDLESS * self.n_envs and not has_ended:
+            self._warn_once(
+                f"after {ENDLESS} random steps no episode has ended, and nothing is learned before one does: give the "
+                "environment a time limit (gymnasium.wrappers.TimeLimit), or pass learning_starts=... and, if episodes "
+                "never end, train_freq=..."
+            )
 
     def _begin_episode(self, index: int, callback: BaseCallback) -> None:
         """A new episode starts with a cold plan."""

@@ -60,8 +60,17 @@ def wrapped_env(env: GymEnv | str) -> VecEnv:
     Dict observations come out of it as vectors.
 
     Raises:
+        TypeError: it is neither an environment nor the id of one.
         ValueError, AssertionError: see `check_env`.
     """
+    if not isinstance(env, (str, gym.Env, VecEnv)):
+        told = (
+            f"the class {env.__name__}: make an instance" if isinstance(env, type) else f"{type(env).__name__} {env!r}"
+        )
+        raise TypeError(
+            "env must be a Gymnasium environment, the id of a registered one, or a VecEnv of Stable-Baselines3 "
+            f"(`make_vec_env`; not Gymnasium's own vector environments), got {told}"
+        )
     vec_env = flattened(BaseAlgorithm._wrap_env(maybe_make_env(env, 0)))
     check_env(vec_env)
     remember_starts(vec_env)
@@ -227,7 +236,7 @@ def check_env(env: VecEnv) -> None:
         where = "" if bad.all() else f" (those at {np.argwhere(bad).tolist()} are not)"
         raise ValueError(
             f"the planner needs finite action bounds{where}, got low = {action.low} and high = {action.high}; "
-            "gymnasium.wrappers.RescaleAction or ClipAction can supply them"
+            "gymnasium.wrappers.TransformAction(env, lambda action: action, Box(low, high)) gives an environment bounds"
         )
     normalize = unwrap_vec_normalize(env)
     if isinstance(normalize, VecNormalize) and normalize.norm_obs:

@@ -25,6 +25,20 @@ def test_discrete_actions_get_the_message_of_sb3():
         agent(with_spaces(action=spaces.Discrete(3)))
 
 
+@pytest.mark.parametrize(
+    ("env", "told"),
+    [
+        (KnownPointMass, "got the class KnownPointMass: make an instance"),
+        (lambda: KnownPointMass(), "got function"),
+        (gym.vector.SyncVectorEnv([KnownPointMass]), "not Gymnasium's own vector environments.*got SyncVectorEnv"),
+        (3, "got int 3"),
+    ],
+)
+def test_what_is_no_environment(env, told, unchecked):
+    with pytest.raises(TypeError, match=f"env must be a Gymnasium environment, .*{told}"):
+        agent(env)
+
+
 def test_unbounded_actions():
     with pytest.raises(ValueError, match=r"finite action bounds, got low = \[-inf\] and high = \[1\.\]"):
         agent(with_spaces(action=spaces.Box(-np.inf, 1.0, (1,), np.float32)))

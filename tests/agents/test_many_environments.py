@@ -205,6 +205,12 @@ def test_a_task_that_never_ends_is_explored_until_the_first_training_is_due():
     assert not learner.is_exploring
 
 
+def test_an_agent_that_waits_for_an_end_says_so(monkeypatch):
+    monkeypatch.setattr("gym_dgpmpc.agents.mpc.ENDLESS", 30)
+    with pytest.warns(UserWarning, match="after 30 random steps no episode has ended.*TimeLimit.*learning_starts"):
+        assert agent(Endless()).learn(40).is_exploring
+
+
 def test_training_every_so_many_steps_goes_before_episodes():
     learner = agent(train_freq=15).learn(50)
     assert learner.dynamics.fits == [10, 25, 40]
