@@ -63,6 +63,14 @@ def wrapped_env(env: GymEnv | str) -> VecEnv:
         TypeError: it is neither an environment nor the id of one.
         ValueError, AssertionError: see `check_env`.
     """
+    _refuse_no_environment(env)
+    vec_env = flattened(BaseAlgorithm._wrap_env(maybe_make_env(env, 0)))
+    check_env(vec_env)
+    remember_starts(vec_env)
+    return vec_env
+
+
+def _refuse_no_environment(env: object) -> None:
     if not isinstance(env, (str, gym.Env, VecEnv)):
         told = (
             f"the class {env.__name__}: make an instance" if isinstance(env, type) else f"{type(env).__name__} {env!r}"
@@ -71,10 +79,6 @@ def wrapped_env(env: GymEnv | str) -> VecEnv:
             "env must be a Gymnasium environment, the id of a registered one, or a VecEnv of Stable-Baselines3 "
             f"(`make_vec_env`; not Gymnasium's own vector environments), got {told}"
         )
-    vec_env = flattened(BaseAlgorithm._wrap_env(maybe_make_env(env, 0)))
-    check_env(vec_env)
-    remember_starts(vec_env)
-    return vec_env
 
 
 def find_task(
