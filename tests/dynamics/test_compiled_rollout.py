@@ -140,6 +140,26 @@ def test_the_argument_may_be_a_view_of_another_precision():
     assert torch.equal(draw.compiled.trajectories(draw.observation.double(), strided), expected)
 
 
+@pytest.mark.parametrize(
+    ("observation_size", "action_size", "horizon", "message"),
+    [
+        (2, 2, HORIZON, r"observation must have the shape \(3,\), got \(2,\)"),
+        (3, 1, HORIZON, rf"actions must have the shape \[K, H, 2\], got \(4, {HORIZON}, 1\)"),
+        (3, 2, HORIZON + 1, f"plans of at most {HORIZON} steps, got actions for {HORIZON + 1}"),
+    ],
+)
+def test_sizes_that_are_not_the_draws_are_refused(observation_size, action_size, horizon, message):
+    """The compiled code would read beyond its arrays."""
+    sampler = Draw("rbf", 1).compiled
+    with pytest.raises(ValueError, match=message):
+        sampler.trajectories(torch.zeros(observation_size), torch.zeros(4, horizon, action_size))
+
+
+def test_functions_for_a_whole_plan_serve_one_of_any_length():
+    sampler = Draw("rbf", 1, refresh="plan").compiled
+    assert sampler.trajectories(torch.zeros(3), torch.zeros(4, 2 * HORIZON, 2)).isfinite().all()
+
+
 @pytest.mark.parametrize("refresh", ["step", "plan"])
 def test_the_model_draws_compiled_worlds_and_plans_alike_without(refresh):
     generator = seeded()
