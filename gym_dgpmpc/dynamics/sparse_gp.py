@@ -59,8 +59,8 @@ class SparseGPDynamics(Learner[_Fitted]):
             particles of a candidate are replaced by draws from their mean and variance; "AMM", a Gaussian per
             candidate through its exact moments (kernel "rbf", more particles than an observation has numbers).
         add_noise: draw the observations' noise too; PETS draws the function alone.
-        update_within_episode: condition on each new transition at once, hyperparameters and inducing inputs frozen;
-            PETS does so between episodes only.
+        update_within_episode: condition on each new transition at once, hyperparameters and inducing inputs frozen (if
+            ``exact``, each is one more inducing input); PETS does so between episodes only.
         dtype: precision of a rollout's states; the model itself computes in float64.
         device: where tensors live.
 
@@ -129,7 +129,10 @@ class SparseGPDynamics(Learner[_Fitted]):
         model, normalisers, _ = self._require_fit("resample")
         if self.update_within_episode:
             x, y = self._encode(data)
-            self._condition(model, normalisers, Data(normalisers[0](x), normalisers[1](y)))
+            standardised = Data(normalisers[0](x), normalisers[1](y))
+            if self.exact:  # the new transitions are inducing points too
+                model = model._replace(layers=(model.layers[0]._replace(inducing_inputs=standardised.x),))
+            self._condition(model, normalisers, standardised)
         return {}
 
     def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
