@@ -58,7 +58,7 @@ class ConditionalSampler:
         for index, (layer, factor, v) in enumerate(zip(model.layers, factors, whitened, strict=True)):
             value = self._sample_layer(kernel, layer, factor, v, x)
             x = value if index == last else x + value
-        return self._coordinates.decode(observation, x.to(observation.dtype))
+        return self._coordinates.decode(observation, x)
 
     def _sample_layer(self, kernel: Kernel, layer: Layer, factor: Tensor, v: Tensor, x: Tensor) -> Tensor:
         shape = (*x.shape[:-1], v.shape[-1])

@@ -119,6 +119,18 @@ def test_rollouts_have_the_states_shape_and_are_finite(name):
     assert torch.equal(states[..., 2], torch.full_like(states[..., 2], slider.CONSTANT)), "a constant passes through"
 
 
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.family != "truth"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_double_precision_draw_follows_states_of_either_precision(name, dtype):
+    model = CASES[name].make(dtype=torch.float64)
+    model.load_state_dict(trained_state(CASES[name].family))
+    sampler = model.draw(PARTICLES, HORIZON, seeded(5))
+    after = sampler(START.to(dtype).expand(PARTICLES, CANDIDATES, -1), actions()[:, 0].to(dtype), 0)
+    assert after.dtype == dtype and after.isfinite().all()
+    states = rollout(model.draw(PARTICLES, HORIZON, seeded(5)), START.to(dtype), actions(), PARTICLES)
+    assert torch.equal(states[1], after) and states.isfinite().all()
+
+
 def test_the_generator_decides_everything(name):
     model = fitted(name)
     torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
