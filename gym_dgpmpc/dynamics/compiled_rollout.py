@@ -5,6 +5,7 @@ functions through all steps at once, several times faster on a CPU and equal to 
 """
 
 import ctypes
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -224,6 +225,10 @@ def _library() -> ctypes.CDLL | None:
 @cache
 def _threads(num_threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_threads, thread_name_prefix="rollout")
+
+
+if hasattr(os, "register_at_fork"):  # a forked child inherits the pools, but none of their threads
+    os.register_at_fork(after_in_child=_threads.cache_clear)
 
 
 def _pointer(tensor: Tensor) -> "ctypes._Pointer[ctypes.c_float]":

@@ -1,5 +1,10 @@
 """Compiled rollouts against the same functions evaluated step by step with PyTorch, in single and double precision."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -116,6 +121,29 @@ def test_any_number_of_candidates_and_threads(num_candidates):
     assert torch.equal(found[0], found[2])
     alone = torch.cat([draw.compiled.trajectories(draw.observation, a[None]) for a in actions], dim=2)
     assert torch.equal(found[0], alone), "a candidate's trajectory depends on its neighbours"
+
+
+FORKED = """
+import multiprocessing, torch
+from tests.dynamics.test_compiled_rollout import Draw
+torch.set_num_threads(2)
+draw = Draw("rbf", 1)
+actions = draw.actions(100)
+expected = draw.compiled.trajectories(draw.observation, actions)
+def same(_): return torch.equal(draw.compiled.trajectories(draw.observation, actions), expected)
+with multiprocessing.get_context("fork").Pool(1) as pool:
+    print(pool.map_async(same, [0]).get(timeout=20))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_child_has_threads_of_its_own():
+    """The parent's are not in it, and it would wait for them for ever."""
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", FORKED], cwd=root, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.stdout == "[True]\n", done.stderr
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
