@@ -131,6 +131,20 @@ def test_a_double_precision_draw_follows_states_of_either_precision(name, dtype)
     assert torch.equal(states[1], after) and states.isfinite().all()
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.family != "truth"])
+def test_a_candidate_that_is_not_finite_keeps_that_to_itself(name, value):
+    sampler = fitted(name).draw(PARTICLES, HORIZON, seeded(5))
+    states = START.expand(PARTICLES, CANDIDATES, -1).clone()
+    states[0, 1, 0] = value
+    after = sampler(states, actions()[:, 0], 0)
+    assert not after[:, 1].isfinite().all()
+    others = [0, 2]
+    assert after[:, others].isfinite().all()
+    if CASES[name].family.startswith("deep"):  # whose draws move particles one by one
+        assert after[1:].isfinite().all()
+
+
 def test_the_generator_decides_everything(name):
     model = fitted(name)
     torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
