@@ -51,6 +51,16 @@ class Trained(NamedTuple):
     """Those asked for, but for the step sizes if they had to be made smaller."""
 
 
+class Sampled(NamedTuple):
+    """The outcome of `sample_pool`."""
+
+    pool: Float[Tensor, "n V"]
+    chain: SGHMCState
+    """At the last of the samples."""
+    step_size: float
+    """The one asked for, unless it had to be made smaller."""
+
+
 def train(
     kernel: Kernel,
     model: DeepGP,
@@ -108,8 +118,8 @@ def sample_pool(
     spacing: int,
     generator: torch.Generator,
     settings: InferenceSettings,
-) -> tuple[Float[Tensor, "n V"], SGHMCState]:
-    """Posterior samples ``spacing`` steps apart, and the chain at the last of them.
+) -> Sampled:
+    """Posterior samples ``spacing`` steps apart.
 
     Begins anew with half the step size if the chain leaves what is plausible.
 
@@ -123,7 +133,7 @@ def sample_pool(
             positions.append(last.position)
         pool = torch.stack(positions)
         if is_plausible(pool):
-            return pool, last
+            return Sampled(pool, last, settings.step_size)
         settings = replace(settings, step_size=0.5 * settings.step_size)
     raise TrainingError(
         f"sampling the posterior diverged {MAX_ROLLBACKS + 1} times, the last time with the step size "
