@@ -128,12 +128,13 @@ def sample_pool(
     """
     factors = factorise_all(kernel, model)
     for _ in range(MAX_ROLLBACKS + 1):
-        positions, last = [], chain
-        for last in mcem.sample(kernel, model, chain, data, num_samples, spacing, generator, settings, factors):
-            positions.append(last.position)
-        pool = torch.stack(positions)
-        if is_plausible(pool):
-            return Sampled(pool, last, settings.step_size)
+        try:
+            states = list(mcem.sample(kernel, model, chain, data, num_samples, spacing, generator, settings, factors))
+            pool = torch.stack([state.position for state in states])
+        except FactorisationError:  # of an exact draw: the steps before it led to what is not finite
+            pool = None
+        if pool is not None and is_plausible(pool):
+            return Sampled(pool, states[-1], settings.step_size)
         settings = replace(settings, step_size=0.5 * settings.step_size)
     raise TrainingError(
         f"sampling the posterior diverged {MAX_ROLLBACKS + 1} times, the last time with the step size "

@@ -204,12 +204,13 @@ def test_held_out_rows_are_not_trained_on():
     assert training._split(Data(many, many), seeded())[1].num_rows == training.HELD_OUT[1]
 
 
-def test_sampling_that_diverges_begins_anew_with_smaller_steps():
+@pytest.mark.parametrize(("num_layers", "gibbs_every"), [(1, 0), (2, 0), (2, 20)])
+def test_sampling_that_diverges_begins_anew_with_smaller_steps(num_layers, gibbs_every):
     data = waves(40, 0)
-    model, chain = started(data, 1)
+    model, chain = started(data, num_layers)
     # A preconditioner far too large for the curvature: unstable until the step has been halved a few times.
     wild = chain._replace(square=torch.full_like(chain.square, 1e-2))
-    settings = InferenceSettings(gibbs_every=0, step_size=1.0)
+    settings = InferenceSettings(gibbs_every=gibbs_every, step_size=1.0)
     pool, last, step_size = training.sample_pool("rbf", model, wild, data, 10, 20, seeded(), settings)
     assert training.is_plausible(pool) and torch.equal(pool[-1], last.position)
     assert step_size in [0.5**halvings for halvings in range(1, training.MAX_ROLLBACKS + 1)]
@@ -217,7 +218,7 @@ def test_sampling_that_diverges_begins_anew_with_smaller_steps():
         TrainingError, match="sampling the posterior diverged 6 times, the last time with the step size"
     ):
         training.sample_pool(
-            "rbf", model, wild, data, 10, 20, seeded(), InferenceSettings(gibbs_every=0, step_size=1e3)
+            "rbf", model, wild, data, 10, 20, seeded(), InferenceSettings(gibbs_every=gibbs_every, step_size=1e3)
         )
 
 
