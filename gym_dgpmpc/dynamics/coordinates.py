@@ -32,9 +32,7 @@ class Coordinates:
         self.encoder, self.dtype = encoder, dtype
         self.input_mean, self.input_scale = inputs.mean.to(dtype), (1.0 / inputs.std).to(dtype)
         size = encoder.observation_size
-        self.carried = torch.ones(size, dtype=dtype, device=self.input_mean.device)
-        self.carried[list(encoder.spec.absolute)] = 0.0
-        self.carried[list(encoder.spec.constant)] = 1.0
+        self.carried = encoder.carried.to(self.input_mean)
         self._all_carried = not encoder.spec.absolute
         self.spread = targets.std.to(dtype)
         # One affine map from standardised targets to the observation's dimensions.
@@ -49,7 +47,7 @@ class Coordinates:
         raw = self.encoder.inputs(observation, action.expand(observation.shape[0], -1, -1))
         return raw.sub_(self.input_mean).mul_(self.input_scale)
 
-    def decode(self, observation: Float[Tensor, "P K S"], target: Float[Tensor, "P K T"]) -> Float[Tensor, "P K S"]:
+    def decode(self, observation: Float[Tensor, "*b S"], target: Float[Tensor, "*b T"]) -> Float[Tensor, "*b S"]:
         """The next observation from a standardised target, in the precision of ``observation``."""
         before = observation.to(self.dtype)
         kept = before if self._all_carried else before * self.carried

@@ -29,17 +29,14 @@ from gym_dgpmpc.dynamics.deep_gp_draws import (
 )
 from gym_dgpmpc.dynamics.deep_gp_start import initial_model, relocate, restandardise
 from gym_dgpmpc.dynamics.learner import Learner, check_counts
-from gym_dgpmpc.dynamics.state import take_tensor
+from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
 from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
 from gym_dgpmpc.gp.kernels import Kernel, check_kernel
-from gym_dgpmpc.gp.layer import Layer
 from gym_dgpmpc.inference import mcem, sghmc, training
 from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
 from gym_dgpmpc.inference.mcem import Data, InferenceSettings
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
-
-_NORMALISERS = ("inputs", "targets")
 
 
 class _Fitted(NamedTuple):
@@ -162,13 +159,11 @@ class DeepGPDynamics(Learner[_Fitted]):
             ValueError: there are no transitions.
             TrainingError: training diverged however small its steps; the model is as it was.
         """
-        x, y = self._encode(data)
-        normalisers = Normaliser.fit(x), Normaliser.fit(y)
-        standardised = Data(normalisers[0](x), normalisers[1](y))
+        normalisers, standardised = self._standardised(data)
         if self._fitted is None:
             iterations = self.first_iterations
             model = initial_model(standardised, self.num_layers, self.num_inducing, generator)
-            whitened = x.new_zeros(model.num_whitened())
+            whitened = standardised.x.new_zeros(model.num_whitened())
         else:
             iterations, last = self.iterations, self._fitted
             model, whitened = restandardise(last.model, last.chain.position, last.normalisers, normalisers)
@@ -267,8 +262,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             state["step_size"] = fitted.step_size
         for index, layer in enumerate(fitted.model.layers):
             state |= {f"layers.{index}.{name}": value for name, value in layer._asdict().items()}
-        for name, normaliser in zip(_NORMALISERS, fitted.normalisers, strict=True):
-            state |= {f"{name}.{key}": value for key, value in normaliser._asdict().items()}
+        state |= normalisers_state(*fitted.normalisers)
         return state | {f"chain.{name}": value for name, value in fitted.chain._asdict().items()}
 
     def load_state_dict(self, state: StateDict) -> None:
@@ -280,25 +274,18 @@ class DeepGPDynamics(Learner[_Fitted]):
         if not state:
             self._fitted, self._factors = None, []
             return
-        outputs = [self.encoder.input_size] * (self.num_layers - 1) + [self.encoder.target_size]
-        whitened = self.num_inducing * sum(outputs)
-        layer_shapes = ((self.num_inducing, self.encoder.input_size), (self.encoder.input_size,), ())
+        size, num_targets, device = self.encoder.input_size, self.encoder.target_size, self.device
+        whitened = self.num_inducing * (size * (self.num_layers - 1) + num_targets)
 
         def take(name: str, *shape: int) -> Tensor:
-            return take_tensor(state, name, shape, self.device)
+            return take_tensor(state, name, shape, device)
 
-        layers = tuple(
-            Layer(
-                *(take(f"layers.{i}.{name}", *shape) for name, shape in zip(Layer._fields, layer_shapes, strict=True))
-            )
-            for i in range(self.num_layers)
+        layers = (take_layer(state, f"layers.{i}.", self.num_inducing, size, device) for i in range(self.num_layers))
+        model = DeepGP(tuple(layers), take("log_noise", num_targets))
+        normalisers = (
+            take_normaliser(state, "inputs", size, device),
+            take_normaliser(state, "targets", num_targets, device),
         )
-        sizes = (self.encoder.input_size, self.encoder.target_size)
-        inputs, targets = (
-            Normaliser(*(take(f"{name}.{key}", size) for key in Normaliser._fields))
-            for name, size in zip(_NORMALISERS, sizes, strict=True)
-        )
-        model = DeepGP(layers, take("log_noise", self.encoder.target_size))
         chain = sghmc.SGHMCState(*(take(f"chain.{name}", whitened) for name in sghmc.SGHMCState._fields))
         pool, oldest = take("pool", self.num_samples, whitened), state.get("oldest")
         if not isinstance(oldest, int) or not 0 <= oldest < self.num_samples:
@@ -309,7 +296,7 @@ class DeepGPDynamics(Learner[_Fitted]):
         if not isinstance(step_size, float) or not 0.0 < step_size < math.inf:
             raise ValueError(f"dynamics state 'step_size': expected a positive number, received {step_size!r}")
         self._factors = factorise_all(self.kernel, model)
-        self._fitted = _Fitted(model, (inputs, targets), chain, pool, oldest, step_size)
+        self._fitted = _Fitted(model, normalisers, chain, pool, oldest, step_size)
 
     def _diagnostics(self, fitted: _Fitted) -> dict[str, float]:
         """Mixing of the kept samples (medians over coordinates), and the fitted noise and kernel scales."""

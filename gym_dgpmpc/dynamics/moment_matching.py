@@ -104,9 +104,7 @@ class MomentMatchingSampler:
         self._predictor, self._encoder, self._inputs, self._targets = predictor, encoder, inputs, targets
         self._noise = noise_variance
         self._frame = orthonormal_frame(num_particles, size, generator).to(inputs.mean)
-        carried = torch.ones(size, dtype=inputs.mean.dtype, device=inputs.mean.device)
-        carried[[i for i in encoder.spec.absolute if i not in encoder.spec.constant]] = 0.0
-        self._carried = carried
+        self._carried = encoder.carried.to(inputs.mean)
 
     @torch.no_grad()
     def __call__(

@@ -18,7 +18,7 @@ from gym_dgpmpc.dynamics.deep_gp_start import NOISE_VARIANCE, restandardise
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner, check_counts
 from gym_dgpmpc.dynamics.moment_matching import MomentMatchingSampler
-from gym_dgpmpc.dynamics.state import take_tensor
+from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
 from gym_dgpmpc.gp.deep_gp import DeepGP
 from gym_dgpmpc.gp.kernels import Kernel, check_kernel
 from gym_dgpmpc.gp.layer import Layer
@@ -30,8 +30,6 @@ from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, Transition
 
 GPDraw = Literal["DS", "MM", "AMM"]
 GP_DRAWS: tuple[GPDraw, ...] = get_args(GPDraw)
-
-_NORMALISERS = ("inputs", "targets")
 
 
 class _Fitted(NamedTuple):
@@ -105,9 +103,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         Raises:
             ValueError: there are no transitions.
         """
-        x, y = self._encode(data)
-        normalisers = Normaliser.fit(x), Normaliser.fit(y)
-        standardised = Data(normalisers[0](x), normalisers[1](y))
+        normalisers, standardised = self._standardised(data)
         start = self._start(standardised, normalisers, generator)
         found = maximise_bound(
             self.kernel, start, standardised, self.max_iterations, free_inducing_inputs=not self.exact
@@ -161,8 +157,7 @@ class SparseGPDynamics(Learner[_Fitted]):
             return {}
         model, normalisers, posterior = self._fitted
         state: StateDict = {**model.layers[0]._asdict(), "log_noise": model.log_noise}
-        for name, normaliser in zip(_NORMALISERS, normalisers, strict=True):
-            state |= {f"{name}.{key}": value for key, value in normaliser._asdict().items()}
+        state |= normalisers_state(*normalisers)
         return state | {f"posterior.{key}": value for key, value in posterior._asdict().items()}
 
     def load_state_dict(self, state: StateDict) -> None:
@@ -179,17 +174,16 @@ class SparseGPDynamics(Learner[_Fitted]):
         received = state.get("inducing_inputs")
         count = len(received) if isinstance(received, Tensor) and received.ndim == 2 else self.num_inducing
         count = count if self.exact else min(count, self.num_inducing)
-        shapes = ((count, sizes[0]), (sizes[0],), ())
-        layer = Layer(*(take_tensor(state, *pair, device) for pair in zip(Layer._fields, shapes, strict=True)))
+        layer = take_layer(state, "", count, sizes[0], device)
         model = DeepGP((layer,), take_tensor(state, "log_noise", (sizes[1],), device))
-        inputs, targets = (
-            Normaliser(*(take_tensor(state, f"{name}.{key}", (size,), device) for key in Normaliser._fields))
-            for name, size in zip(_NORMALISERS, sizes, strict=True)
+        normalisers = (
+            take_normaliser(state, "inputs", sizes[0], device),
+            take_normaliser(state, "targets", sizes[1], device),
         )
         matrices = ((count, count), (count,), (count, sizes[1]))
         names = (f"posterior.{name}" for name in SparsePosterior._fields)
         posterior = SparsePosterior(*(take_tensor(state, *pair, device) for pair in zip(names, matrices, strict=True)))
-        self._fitted = _Fitted(model, (inputs, targets), posterior)
+        self._fitted = _Fitted(model, normalisers, posterior)
 
     def _start(self, data: Data, normalisers: tuple[Normaliser, Normaliser], generator: torch.Generator) -> DeepGP:
         """Hyperparameters of the last training in the new standardisation, or fixed ones; fresh inducing inputs."""

@@ -16,7 +16,7 @@ from gym_dgpmpc.dynamics.ensemble_draws import PROPAGATIONS
 from gym_dgpmpc.dynamics.sparse_gp import GP_DRAWS, SparseGPDynamics
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.planning.rollout import rollout
-from gym_dgpmpc.types import DynamicsModel, TransitionSampler
+from gym_dgpmpc.types import DynamicsModel, Transitions, TransitionSampler
 from tests.oracles import linear_gaussian, slider
 from tests.oracles.models import seeded
 
@@ -207,6 +207,18 @@ def test_a_state_with_a_hole_is_refused_and_changes_nothing(learner):
 def test_nothing_to_learn_from_is_an_error(learner):
     with pytest.raises(ValueError, match="0 transitions"):
         CASES[learner].make().fit(slider.transitions(0, NOISE), seeded())
+
+
+@pytest.mark.parametrize("learner", [FAMILIES["sparse"], FAMILIES["deep2"]])
+def test_the_rounding_of_a_large_number_is_not_a_target(learner):
+    """A position of 5,000 that only its last bit changes: its noise would count as much as what is to be learned."""
+    observation, action, after = slider.transitions(NUM_DATA, NOISE)
+    bits = torch.randint(-1, 2, (2, NUM_DATA), generator=seeded())
+    observation[:, 0], after[:, 0] = 5000 + bits * 2.0**-11
+    model = CASES[learner].make()
+    model.fit(Transitions(observation, action, after), seeded())
+    assert model.state_dict()["targets.std"][0] == 1.0
+    assert model.state_dict()["targets.std"][1] < 1.0
 
 
 def test_training_is_decided_by_its_generator(learner):
