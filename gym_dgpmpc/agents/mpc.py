@@ -192,7 +192,9 @@ class MPCAgent(ActingAgent):
 
             # Re-sample the inducing outputs U.
             if self.is_fitted:
-                self.dynamics.resample(self.modelled.transitions(self.store), self.generators.fit)
+                metrics = self.dynamics.resample(self.modelled.transitions(self.store), self.generators.fit)
+                for name, value in metrics.items():
+                    self.logger.record_mean(f"train/{name}", float(value))
 
             if np.any(dones):
                 self._update_info_buffer(infos, dones)

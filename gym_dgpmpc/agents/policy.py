@@ -32,7 +32,7 @@ class PlanningPolicy:
         time_budget: seconds that a plan may take, or None; see `plan`.
 
     Raises:
-        ValueError: a number is out of its range.
+        ValueError: a number is out of its range, or the planner's actions are not those of ``action_space``.
     """
 
     def __init__(
@@ -55,6 +55,9 @@ class PlanningPolicy:
         self.cold = PlanState(planner.initial_plan())
         """Where the first plan of an episode starts from."""
         self.horizon = self.cold.plan.mean.shape[0]
+        planned, needed = self.cold.plan.mean.shape[1], math.prod(action_space.shape)
+        if planned != needed:
+            raise ValueError(f"the planner plans actions of {planned} numbers, the action space has {needed}")
         if num_particles < 1:
             raise ValueError(f"num_particles must be at least 1, got {num_particles}")
         if not 1 <= actions_per_plan <= self.horizon:

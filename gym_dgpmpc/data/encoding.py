@@ -45,7 +45,9 @@ class VectorColumns(NamedTuple):
 
 
 class Encoder:
-    """Maps (observation, action) to a model's inputs, (observation, next observation) to its targets, and back.
+    """Maps (observation, action) to a model's inputs and (observation, next observation) to its targets.
+
+    The way back from a target is in `dynamics/coordinates.py`.
 
     Inputs are ordered: the plain dimensions in the order of the observation, then sines, then cosines of the angles,
     then the action. Targets are the non-constant dimensions in the order of the observation. Of a vector in
@@ -55,6 +57,13 @@ class Encoder:
         observation_size: S.
         action_size: A.
         spec: how to read the observation; indices must lie in [0, S).
+
+    Attributes:
+        plain, angles: which numbers of an observation are fed as they are, and which as sine and cosine.
+        predicted: which numbers have a target.
+        input_size, target_size: D and T.
+        carried: [S], 1 where the next observation is the present one and what is added to it, 0 where it is absolute.
+        vectors: `ObservationSpec.body_frame` in columns.
 
     Raises:
         ValueError: an index is out of range or repeated, a vector's two numbers are not of one kind, or nothing is left
@@ -76,6 +85,9 @@ class Encoder:
         self.target_size = len(self.predicted)
         if not self.input_size:
             raise ValueError(f"nothing is left to feed: there is no action, and not_inputs is everything in {spec}")
+        self.carried = torch.tensor(
+            [float(i in spec.constant or i not in spec.absolute) for i in range(observation_size)]
+        )
         self._is_change = torch.tensor([i not in spec.absolute for i in self.predicted])
         self._wraps = torch.tensor([i in spec.angles and i not in spec.absolute for i in self.predicted])
         self.vectors = VectorColumns.of(spec.body_frame)
@@ -102,15 +114,15 @@ class Encoder:
             target = torch.where(self._wraps.to(after.device), target - turn * torch.round(target / turn), target)
         return self._predicted_vectors.turned(target, observation, -1.0)
 
-    def next_observation(
-        self, observation: Float[Tensor, "*b S"], target: Float[Tensor, "*b T"]
-    ) -> Float[Tensor, "*b S"]:
-        """Inverse of `targets` in its second argument, up to whole turns of an angle."""
-        out = observation.clone()
-        is_change = self._is_change.to(observation.device)
-        along_axes = self._predicted_vectors.turned(target, observation, 1.0)
-        out[..., self.predicted] = along_axes + torch.where(is_change, observation[..., self.predicted], 0.0)
-        return out
+    def target_magnitudes(
+        self, observation: Float[Tensor, "N S"], next_observation: Float[Tensor, "N S"]
+    ) -> Float[Tensor, "T"]:
+        """The largest number that each target was computed from: it says how much of a target may be rounding."""
+        before, after = (states[:, self.predicted].abs().amax(0) for states in (observation, next_observation))
+        largest = torch.where(self._is_change.to(after.device), torch.maximum(before, after), after)
+        x, y = self._predicted_vectors.x, self._predicted_vectors.y
+        largest[x] = largest[y] = torch.maximum(largest[x], largest[y])
+        return largest
 
 
 def _check_indices(observation_size: int, spec: ObservationSpec) -> None:

@@ -14,15 +14,20 @@ class Normaliser(NamedTuple):
     std: Float[Tensor, "D"]
 
     @classmethod
-    def fit(cls, data: Float[Tensor, "N D"]) -> "Normaliser":
+    def fit(cls, data: Float[Tensor, "N D"], magnitude: Float[Tensor, "D"] | None = None) -> "Normaliser":
         """Mean and standard deviation of the data.
 
         A dimension that does not vary beyond the rounding of float32 observations gets unit scale, so that it maps
         to zero instead of to amplified rounding.
+
+        Args:
+            magnitude: of the observations that the data were computed from, where it is not the data's own: a change
+                has the rounding of the two numbers that it is the difference of.
         """
         data = data.double()
         mean, std = data.mean(0), data.std(0, correction=0)
-        rounding = 4 * torch.finfo(torch.float32).eps * data.abs().amax(0)
+        magnitude = data.abs().amax(0) if magnitude is None else magnitude
+        rounding = 4 * torch.finfo(torch.float32).eps * magnitude
         return cls(mean, torch.where(std > rounding.clamp_min(1e-12), std, 1.0))
 
     def __call__(self, raw: Float[Tensor, "*b D"]) -> Float[Tensor, "*b D"]:

@@ -64,7 +64,8 @@ class TransitionStore:
         """Add one step: ``observation`` and ``next_observation`` [S], ``action`` [A].
 
         Raises:
-            EnvironmentDataError: a shape is wrong, or a component is not finite as float32.
+            EnvironmentDataError: a shape is wrong, a component is not finite as float32, or a termination or episode is
+                not what its kind can hold.
         """
         row = (observation, action, next_observation, reward, terminated, episode)
         self._add(*(np.asarray(value)[None] for value in row))
@@ -82,7 +83,8 @@ class TransitionStore:
         """Add n steps, or none of them: observations [n, S], actions [n, A] and the rest [n].
 
         Raises:
-            EnvironmentDataError: a shape is wrong, or a component is not finite as float32.
+            EnvironmentDataError: a shape is wrong, a component is not finite as float32, or a termination or episode is
+                not what its kind can hold.
         """
         rows = (observation, action, next_observation, reward, terminated, episode)
         self._add(*(np.asarray(value) for value in rows))
@@ -156,12 +158,14 @@ class TransitionStore:
             raise EnvironmentDataError(f"step {self._length}: {name} must be numeric, got dtype {value.dtype}")
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is reported below, with its place
             converted = value.astype(dtype)
-        bad = np.argwhere(~np.isfinite(converted))
+        kept = np.isfinite(converted) if buffer.is_floating_point() else converted == value
+        bad = np.argwhere(~kept)
         if len(bad):
             row, *component = bad[0].tolist()
             where = f"{name}{component or ''}"
+            wanted = {"b": "true or false", "i": "a whole number"}.get(dtype.kind, "finite as float32")
             raise EnvironmentDataError(
-                f"step {self._length + row}: {where} must be finite as float32, got {value[tuple(bad[0])]}"
+                f"step {self._length + row}: {where} must be {wanted}, got {value[tuple(bad[0])]}"
             )
         return converted
 

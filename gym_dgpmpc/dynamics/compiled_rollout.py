@@ -5,6 +5,7 @@ functions through all steps at once, several times faster on a CPU and equal to 
 """
 
 import ctypes
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -148,8 +149,10 @@ class CompiledRollout:
         Runs on as many threads as PyTorch is set to use, and gives the same values for any number of them.
 
         Raises:
+            ValueError: the sizes are not those of the draw, or the plan has more steps than it has functions.
             MemoryError: there was no memory for a few kilobytes per thread.
         """
+        self._check_sizes(observation, actions)
         num_candidates, horizon, _ = actions.shape
         task = _Task.from_buffer_copy(self._task)
         start = observation.to(torch.float32).contiguous()
@@ -170,6 +173,21 @@ class CompiledRollout:
         if failed:
             raise MemoryError("there was no memory for the scratch space of a rollout")
         return states
+
+    def _check_sizes(self, observation: Tensor, actions: Tensor) -> None:
+        """The compiled code believes every size, and would read beyond the arrays."""
+        task = self._task
+        if observation.shape != (task.observation_size,):
+            raise ValueError(
+                f"the observation must have the shape ({task.observation_size},), got {tuple(observation.shape)}"
+            )
+        if actions.ndim != 3 or actions.shape[2] != task.action_size:
+            raise ValueError(f"the actions must have the shape [K, H, {task.action_size}], got {tuple(actions.shape)}")
+        if task.num_functions > 1 and actions.shape[1] > task.num_functions:
+            raise ValueError(
+                f"these worlds were drawn for plans of at most {task.num_functions} steps, got actions for "
+                f"{actions.shape[1]}"
+            )
 
     def _packed(self, layer: PathwiseLayer, units: int) -> _Layer:
         """A layer in the layout of the compiled code, M and F padded to whole blocks of functions that are zero."""
@@ -207,6 +225,10 @@ def _library() -> ctypes.CDLL | None:
 @cache
 def _threads(num_threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_threads, thread_name_prefix="rollout")
+
+
+if hasattr(os, "register_at_fork"):  # a forked child inherits the pools, but none of their threads
+    os.register_at_fork(after_in_child=_threads.cache_clear)
 
 
 def _pointer(tensor: Tensor) -> "ctypes._Pointer[ctypes.c_float]":

@@ -5,6 +5,7 @@ source, compiler, flags and processor it was built from and for. Used by `compil
 package works all the same, only slower.
 """
 
+import atexit
 import ctypes
 import functools
 import hashlib
@@ -57,7 +58,7 @@ def find_compiler() -> list[str]:
 
 
 def cache_folder() -> Path:
-    """Where built libraries are kept: a folder that only this user can write to.
+    """Where built libraries are kept: a folder that only this user can write to, or one that ends with the process.
 
     Raises:
         CompilerError: the folder belongs to someone else, who could have put anything there.
@@ -67,7 +68,9 @@ def cache_folder() -> Path:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError:  # no home folder, or one that cannot be written: build anew in every process
-        return Path(tempfile.mkdtemp(prefix="gym_dgpmpc-"))
+        temporary = tempfile.mkdtemp(prefix="gym_dgpmpc-")
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        return Path(temporary)
     status = folder.stat()
     if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o022):
         raise CompilerError(f"{folder} can be written to by other users: remove it, or set XDG_CACHE_HOME")

@@ -19,7 +19,7 @@ class Coordinates:
         encoder: what is fed and predicted.
         inputs: standardisation of the encoded inputs, size D.
         targets: standardisation of the targets, size T.
-        dtype: precision of the rollout.
+        dtype: precision of the rollout, whatever that of the states that come in; those that go out have theirs.
 
     Attributes:
         input_mean, input_scale: of the encoded inputs, [D].
@@ -29,12 +29,10 @@ class Coordinates:
     """
 
     def __init__(self, encoder: Encoder, inputs: Normaliser, targets: Normaliser, dtype: torch.dtype):
-        self.encoder = encoder
+        self.encoder, self.dtype = encoder, dtype
         self.input_mean, self.input_scale = inputs.mean.to(dtype), (1.0 / inputs.std).to(dtype)
         size = encoder.observation_size
-        self.carried = torch.ones(size, dtype=dtype, device=self.input_mean.device)
-        self.carried[list(encoder.spec.absolute)] = 0.0
-        self.carried[list(encoder.spec.constant)] = 1.0
+        self.carried = encoder.carried.to(self.input_mean)
         self._all_carried = not encoder.spec.absolute
         self.spread = targets.std.to(dtype)
         # One affine map from standardised targets to the observation's dimensions.
@@ -45,11 +43,13 @@ class Coordinates:
 
     def encode(self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"]) -> Float[Tensor, "P K D"]:
         """Standardised model inputs."""
+        observation, action = observation.to(self.dtype), action.to(self.dtype)
         raw = self.encoder.inputs(observation, action.expand(observation.shape[0], -1, -1))
         return raw.sub_(self.input_mean).mul_(self.input_scale)
 
-    def decode(self, observation: Float[Tensor, "P K S"], target: Float[Tensor, "P K T"]) -> Float[Tensor, "P K S"]:
-        """The next observation from a standardised target."""
-        kept = observation if self._all_carried else observation * self.carried
-        added = (target @ self._spread).add_(self.shift)
-        return self.encoder.vectors.turned(added, observation, 1.0).add_(kept)
+    def decode(self, observation: Float[Tensor, "*b S"], target: Float[Tensor, "*b T"]) -> Float[Tensor, "*b S"]:
+        """The next observation from a standardised target, in the precision of ``observation``."""
+        before = observation.to(self.dtype)
+        kept = before if self._all_carried else before * self.carried
+        added = (target.to(self.dtype) @ self._spread).add_(self.shift)
+        return self.encoder.vectors.turned(added, before, 1.0).add_(kept).to(observation.dtype)

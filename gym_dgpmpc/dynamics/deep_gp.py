@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from gym_dgpmpc.data.normaliser import Normaliser
@@ -28,16 +29,14 @@ from gym_dgpmpc.dynamics.deep_gp_draws import (
 )
 from gym_dgpmpc.dynamics.deep_gp_start import initial_model, relocate, restandardise
 from gym_dgpmpc.dynamics.learner import Learner, check_counts
-from gym_dgpmpc.dynamics.state import take_tensor
+from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
+from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
 from gym_dgpmpc.gp.kernels import Kernel, check_kernel
-from gym_dgpmpc.gp.layer import Layer
 from gym_dgpmpc.inference import mcem, sghmc, training
 from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
 from gym_dgpmpc.inference.mcem import Data, InferenceSettings
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
-
-_NORMALISERS = ("inputs", "targets")
 
 
 class _Fitted(NamedTuple):
@@ -48,6 +47,7 @@ class _Fitted(NamedTuple):
     chain: sghmc.SGHMCState
     pool: Tensor  # "num_samples V", a ring
     oldest: int  # the row of the pool that the next sample replaces
+    step_size: float  # of SG-HMC: the one asked for, unless training had to take smaller steps
 
 
 class _Standardised(NamedTuple):
@@ -86,7 +86,8 @@ class DeepGPDynamics(Learner[_Fitted]):
         num_samples: size of the pool of posterior samples.
         sample_spacing: SG-HMC steps between two samples of the pool.
         resample_steps: SG-HMC steps of one `resample`; 0 leaves the posterior as it is within an episode.
-        resample_samples: samples of the pool that one `resample` replaces, if the last layer is drawn exactly.
+        resample_samples: samples of the pool that one `resample` replaces, if the last layer is drawn exactly; at
+            least 1 (``resample_steps=0`` turns re-sampling off).
         relocate: move the inducing inputs to the grown data's cluster centres before each later fit.
         inference: settings of the sampler and the optimiser.
         compile: roll pathwise draws out in compiled code, several times faster; where there is no compiler, or for
@@ -130,6 +131,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             iterations=iterations,
             num_samples=num_samples,
             sample_spacing=sample_spacing,
+            resample_samples=resample_samples,
         )
         if resample_steps < 0:
             raise ValueError(f"resample_steps must be at least 0, received {resample_steps}")
@@ -157,13 +159,11 @@ class DeepGPDynamics(Learner[_Fitted]):
             ValueError: there are no transitions.
             TrainingError: training diverged however small its steps; the model is as it was.
         """
-        x, y = self._encode(data)
-        normalisers = Normaliser.fit(x), Normaliser.fit(y)
-        standardised = Data(normalisers[0](x), normalisers[1](y))
+        normalisers, standardised = self._standardised(data)
         if self._fitted is None:
             iterations = self.first_iterations
             model = initial_model(standardised, self.num_layers, self.num_inducing, generator)
-            whitened = x.new_zeros(model.num_whitened())
+            whitened = standardised.x.new_zeros(model.num_whitened())
         else:
             iterations, last = self.iterations, self._fitted
             model, whitened = restandardise(last.model, last.chain.position, last.normalisers, normalisers)
@@ -172,7 +172,7 @@ class DeepGPDynamics(Learner[_Fitted]):
         trained = training.train(
             self.kernel, model, sghmc.init(whitened), standardised, iterations, generator, self.inference
         )
-        pool, chain = training.sample_pool(
+        sampled = training.sample_pool(
             self.kernel,
             trained.model,
             trained.chain,
@@ -182,15 +182,20 @@ class DeepGPDynamics(Learner[_Fitted]):
             generator,
             trained.settings,
         )
-        self._fitted = _Fitted(trained.model, normalisers, chain, pool, 0)
+        self._fitted = _Fitted(trained.model, normalisers, sampled.chain, sampled.pool, 0, sampled.step_size)
         self._factors = factorise_all(self.kernel, trained.model)
         counts = {"iterations": float(trained.num_iterations), "rollbacks": float(trained.num_rollbacks)}
         return {"negative_log_joint": trained.negative_log_joint} | counts | self._diagnostics(self._fitted)
 
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
-        """A few SG-HMC steps on the grown data; the newest sample takes the place of the pool's oldest.
+        """Follow the grown data: the newest samples take the places of the pool's oldest.
 
-        A chain that leaves what is plausible is dropped, and the pool stays as it was.
+        They are ``resample_samples`` exact draws of the last layer, after a few SG-HMC steps over all layers; without
+        exact draws (``gibbs_every=0``) the position that those steps lead to. A chain that leaves what is plausible is
+        dropped, and the pool stays as it was.
+
+        Returns:
+            ``resamplings_dropped``: 1 if that happened, otherwise 0; nothing if there are no steps to take.
 
         Raises:
             RuntimeError: the model was not fitted.
@@ -198,24 +203,34 @@ class DeepGPDynamics(Learner[_Fitted]):
         fitted = self._require_fit("resample")
         if self.resample_steps == 0:
             return {}
-        standardised = _Standardised(self._encode, data, fitted.normalisers)
-        kernel, model, factors, settings = self.kernel, fitted.model, self._factors, self.inference
-        without_gibbs = replace(settings, gibbs_every=0)
-        (chain,) = mcem.sample(
-            kernel, model, fitted.chain, standardised, 1, self.resample_steps, generator, without_gibbs, factors
-        )
-        newest = chain.position.unsqueeze(0)
-        if settings.gibbs_every:
-            newest = mcem.gibbs_positions(
-                kernel, model, factors, chain, standardised, self.resample_samples, generator, settings
-            )
-            chain = chain._replace(position=newest[-1])
+        try:
+            chain, newest = self._newest_samples(fitted, data, generator)
+        except FactorisationError:  # of an exact draw: the steps before it led to what is not finite
+            return {"resamplings_dropped": 1.0}
         if not training.is_plausible(newest):
             return {"resamplings_dropped": 1.0}
         rows = (fitted.oldest + torch.arange(len(newest))) % self.num_samples
         fitted.pool[rows] = newest
         self._fitted = fitted._replace(chain=chain, oldest=(fitted.oldest + len(newest)) % self.num_samples)
         return {"resamplings_dropped": 0.0}
+
+    def _newest_samples(
+        self, fitted: _Fitted, data: Transitions, generator: torch.Generator
+    ) -> tuple[sghmc.SGHMCState, Float[Tensor, "n V"]]:
+        """The chain some steps on, and the samples for the pool, of which the last is where the chain then is."""
+        kernel, model, factors = self.kernel, fitted.model, self._factors
+        standardised = _Standardised(self._encode, data, fitted.normalisers)
+        settings = replace(self.inference, step_size=fitted.step_size)
+        without_gibbs = replace(settings, gibbs_every=0)
+        (chain,) = mcem.sample(
+            kernel, model, fitted.chain, standardised, 1, self.resample_steps, generator, without_gibbs, factors
+        )
+        if not settings.gibbs_every:
+            return chain, chain.position.unsqueeze(0)
+        newest = mcem.gibbs_positions(
+            kernel, model, factors, chain, standardised, self.resample_samples, generator, settings
+        )
+        return chain._replace(position=newest[-1]), newest
 
     def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
         """One sample of the pool per particle (distinct while the pool lasts), for plans of ``horizon`` steps.
@@ -243,10 +258,11 @@ class DeepGPDynamics(Learner[_Fitted]):
         fitted = self._fitted
         # The pool is the one tensor that changes in place, and a state should not change after it was taken.
         state: StateDict = {"pool": fitted.pool.clone(), "oldest": fitted.oldest, "log_noise": fitted.model.log_noise}
+        if fitted.step_size != self.inference.step_size:  # states of before it was kept do not have it either
+            state["step_size"] = fitted.step_size
         for index, layer in enumerate(fitted.model.layers):
             state |= {f"layers.{index}.{name}": value for name, value in layer._asdict().items()}
-        for name, normaliser in zip(_NORMALISERS, fitted.normalisers, strict=True):
-            state |= {f"{name}.{key}": value for key, value in normaliser._asdict().items()}
+        state |= normalisers_state(*fitted.normalisers)
         return state | {f"chain.{name}": value for name, value in fitted.chain._asdict().items()}
 
     def load_state_dict(self, state: StateDict) -> None:
@@ -258,33 +274,29 @@ class DeepGPDynamics(Learner[_Fitted]):
         if not state:
             self._fitted, self._factors = None, []
             return
-        outputs = [self.encoder.input_size] * (self.num_layers - 1) + [self.encoder.target_size]
-        whitened = self.num_inducing * sum(outputs)
-        layer_shapes = ((self.num_inducing, self.encoder.input_size), (self.encoder.input_size,), ())
+        size, num_targets, device = self.encoder.input_size, self.encoder.target_size, self.device
+        whitened = self.num_inducing * (size * (self.num_layers - 1) + num_targets)
 
         def take(name: str, *shape: int) -> Tensor:
-            return take_tensor(state, name, shape, self.device)
+            return take_tensor(state, name, shape, device)
 
-        layers = tuple(
-            Layer(
-                *(take(f"layers.{i}.{name}", *shape) for name, shape in zip(Layer._fields, layer_shapes, strict=True))
-            )
-            for i in range(self.num_layers)
+        layers = (take_layer(state, f"layers.{i}.", self.num_inducing, size, device) for i in range(self.num_layers))
+        model = DeepGP(tuple(layers), take("log_noise", num_targets))
+        normalisers = (
+            take_normaliser(state, "inputs", size, device),
+            take_normaliser(state, "targets", num_targets, device),
         )
-        sizes = (self.encoder.input_size, self.encoder.target_size)
-        inputs, targets = (
-            Normaliser(*(take(f"{name}.{key}", size) for key in Normaliser._fields))
-            for name, size in zip(_NORMALISERS, sizes, strict=True)
-        )
-        model = DeepGP(layers, take("log_noise", self.encoder.target_size))
         chain = sghmc.SGHMCState(*(take(f"chain.{name}", whitened) for name in sghmc.SGHMCState._fields))
         pool, oldest = take("pool", self.num_samples, whitened), state.get("oldest")
         if not isinstance(oldest, int) or not 0 <= oldest < self.num_samples:
             raise ValueError(
                 f"dynamics state 'oldest': expected a row of the pool, 0 to {self.num_samples - 1}, received {oldest!r}"
             )
+        step_size = state.get("step_size", self.inference.step_size)
+        if not isinstance(step_size, float) or not 0.0 < step_size < math.inf:
+            raise ValueError(f"dynamics state 'step_size': expected a positive number, received {step_size!r}")
         self._factors = factorise_all(self.kernel, model)
-        self._fitted = _Fitted(model, (inputs, targets), chain, pool, oldest)
+        self._fitted = _Fitted(model, normalisers, chain, pool, oldest, step_size)
 
     def _diagnostics(self, fitted: _Fitted) -> dict[str, float]:
         """Mixing of the kept samples (medians over coordinates), and the fitted noise and kernel scales."""

@@ -43,7 +43,8 @@ class Posterior(NamedTuple):
 class ConditionalSampler:
     """The draws `joint` and `marginal`: values from p(f | u) at each step, with fresh noise.
 
-    Factorises in the posterior's precision (float64) whatever the precision of the states.
+    Factorises in the posterior's precision (float64) whatever the precision of the states. A point that is not finite
+    is NaN after the step, and no other point feels it.
     """
 
     def __init__(self, posterior: Posterior, coordinates: Coordinates, generator: torch.Generator, *, joint: bool):
@@ -54,11 +55,14 @@ class ConditionalSampler:
     ) -> Float[Tensor, "P K S"]:
         kernel, model, factors, whitened = self._posterior
         x = self._coordinates.encode(observation, action).to(factors[0].dtype)
+        # Jointly drawn points share a covariance, which one that is not finite would make useless for all.
+        lost = ~x.isfinite().all(-1, keepdim=True)
+        x = x.masked_fill(lost, 0.0)
         last = len(factors) - 1
         for index, (layer, factor, v) in enumerate(zip(model.layers, factors, whitened, strict=True)):
             value = self._sample_layer(kernel, layer, factor, v, x)
             x = value if index == last else x + value
-        return self._coordinates.decode(observation, x.to(observation.dtype))
+        return self._coordinates.decode(observation, x).masked_fill(lost, math.nan)
 
     def _sample_layer(self, kernel: Kernel, layer: Layer, factor: Tensor, v: Tensor, x: Tensor) -> Tensor:
         shape = (*x.shape[:-1], v.shape[-1])

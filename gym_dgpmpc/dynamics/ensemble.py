@@ -25,7 +25,7 @@ from gym_dgpmpc.dynamics.ensemble_network import (
 )
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner, check_counts
-from gym_dgpmpc.dynamics.state import take_tensor
+from gym_dgpmpc.dynamics.state import take_normaliser, take_tensor
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
 
@@ -193,11 +193,11 @@ class EnsembleDynamics(Learner[_Fitted]):
             return
 
         shapes = self._shapes()
-        size, device, single = (self.encoder.input_size,), self.device, torch.float32
+        device, single = self.device, torch.float32
         network = Ensemble.from_parameters(
             {name: take_tensor(state, name, shape, device, single) for name, shape in shapes.items()}
         )
-        inputs = Normaliser(*(take_tensor(state, f"inputs.{key}", size, device) for key in Normaliser._fields))
+        inputs = take_normaliser(state, "inputs", self.encoder.input_size, device)
         moments = {
             name: _Moments(
                 *(take_tensor(state, f"adam.{name}.{key}", shape, device, single) for key in _Moments._fields)

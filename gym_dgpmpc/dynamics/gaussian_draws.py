@@ -48,7 +48,7 @@ class GaussianSampler:
     ) -> Float[Tensor, "P K S"]:
         mean, variance = self._predict(self._coordinates.encode(observation, action))
         target = mean if variance is None else mean + variance.sqrt() * normals_like(mean, self._generator)
-        states = self._coordinates.decode(observation, target.to(observation.dtype))
+        states = self._coordinates.decode(observation, target)
         return match_moments(states, self._generator) if self._match_moments else states
 
 

@@ -7,6 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gym_dgpmpc.data.encoding import Encoder
+from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.inference.mcem import Data
 from gym_dgpmpc.types import ObservationSpec, Transitions
 
 Fitted = TypeVar("Fitted")
@@ -45,6 +47,17 @@ class Learner(Generic[Fitted]):
             raise ValueError("cannot fit a dynamics model to 0 transitions")
         observation, action, after = (t.to(self.device, torch.float64) for t in data)
         return self.encoder.inputs(observation, action), self.encoder.targets(observation, after)
+
+    def _standardised(self, data: Transitions) -> tuple[tuple[Normaliser, Normaliser], Data]:
+        """The standardisation of inputs and targets that these transitions give, and what they then are.
+
+        Raises:
+            ValueError: there are no transitions.
+        """
+        x, y = self._encode(data)
+        magnitudes = self.encoder.target_magnitudes(data.observation, data.next_observation)
+        inputs, targets = Normaliser.fit(x), Normaliser.fit(y, magnitudes.to(y))
+        return (inputs, targets), Data(inputs(x), targets(y))
 
     def _require_fit(self, verb: str) -> Fitted:
         if self._fitted is None:

@@ -6,6 +6,7 @@ that their mean and their (population) covariance are exactly its own, and the n
 `TransitionSampler` needs no memory, and the reward is averaged over points spread like the belief.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -70,6 +71,8 @@ def encoded_moments(
 class MomentMatchingSampler:
     """Moves each candidate's Gaussian one step, and spreads the particles by it.
 
+    A candidate with a particle or an action that is not finite is NaN after the step, and no other feels it.
+
     Args:
         predictor: the trained functions, from standardised inputs to standardised targets.
         encoder: what is fed and predicted.
@@ -101,22 +104,23 @@ class MomentMatchingSampler:
         self._predictor, self._encoder, self._inputs, self._targets = predictor, encoder, inputs, targets
         self._noise = noise_variance
         self._frame = orthonormal_frame(num_particles, size, generator).to(inputs.mean)
-        carried = torch.ones(size, dtype=inputs.mean.dtype, device=inputs.mean.device)
-        carried[[i for i in encoder.spec.absolute if i not in encoder.spec.constant]] = 0.0
-        self._carried = carried
+        self._carried = encoder.carried.to(inputs.mean)
 
     @torch.no_grad()
     def __call__(
         self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
     ) -> Float[Tensor, "P K S"]:
-        states = observation.to(self._frame.dtype)
+        # Factorisations are batched over the candidates, and fail for all if one of them is not finite.
+        lost = ~(observation.isfinite().all(-1).all(0) & action.isfinite().all(-1)).unsqueeze(-1)
+        states = observation.to(self._frame.dtype).masked_fill(lost, 0.0)
         mean = states.mean(0)
         deviation = (states - mean).transpose(0, 1)
-        mean, covariance = self.propagate(mean, deviation.mT @ deviation / len(states), action.to(states))
+        actions = action.to(states).masked_fill(lost, 0.0)
+        mean, covariance = self.propagate(mean, deviation.mT @ deviation / len(states), actions)
         values, vectors = torch.linalg.eigh(covariance)
         root = vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)  # rounding leaves values below zero
         spread = torch.einsum("ps,kts->pkt", self._frame, root)
-        return (mean + spread).to(observation.dtype)
+        return (mean + spread).masked_fill(lost, math.nan).to(observation.dtype)
 
     def propagate(
         self, mean: Float[Tensor, "K S"], covariance: Float[Tensor, "K S S"], action: Float[Tensor, "K A"]

@@ -18,7 +18,7 @@ from gym_dgpmpc.dynamics.deep_gp_start import NOISE_VARIANCE, restandardise
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner, check_counts
 from gym_dgpmpc.dynamics.moment_matching import MomentMatchingSampler
-from gym_dgpmpc.dynamics.state import take_tensor
+from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
 from gym_dgpmpc.gp.deep_gp import DeepGP
 from gym_dgpmpc.gp.kernels import Kernel, check_kernel
 from gym_dgpmpc.gp.layer import Layer
@@ -30,8 +30,6 @@ from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, Transition
 
 GPDraw = Literal["DS", "MM", "AMM"]
 GP_DRAWS: tuple[GPDraw, ...] = get_args(GPDraw)
-
-_NORMALISERS = ("inputs", "targets")
 
 
 class _Fitted(NamedTuple):
@@ -59,8 +57,8 @@ class SparseGPDynamics(Learner[_Fitted]):
             particles of a candidate are replaced by draws from their mean and variance; "AMM", a Gaussian per
             candidate through its exact moments (kernel "rbf", more particles than an observation has numbers).
         add_noise: draw the observations' noise too; PETS draws the function alone.
-        update_within_episode: condition on each new transition at once, hyperparameters and inducing inputs frozen;
-            PETS does so between episodes only.
+        update_within_episode: condition on each new transition at once, hyperparameters and inducing inputs frozen (if
+            ``exact``, each is one more inducing input); PETS does so between episodes only.
         dtype: precision of a rollout's states; the model itself computes in float64.
         device: where tensors live.
 
@@ -105,9 +103,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         Raises:
             ValueError: there are no transitions.
         """
-        x, y = self._encode(data)
-        normalisers = Normaliser.fit(x), Normaliser.fit(y)
-        standardised = Data(normalisers[0](x), normalisers[1](y))
+        normalisers, standardised = self._standardised(data)
         start = self._start(standardised, normalisers, generator)
         found = maximise_bound(
             self.kernel, start, standardised, self.max_iterations, free_inducing_inputs=not self.exact
@@ -129,7 +125,10 @@ class SparseGPDynamics(Learner[_Fitted]):
         model, normalisers, _ = self._require_fit("resample")
         if self.update_within_episode:
             x, y = self._encode(data)
-            self._condition(model, normalisers, Data(normalisers[0](x), normalisers[1](y)))
+            standardised = Data(normalisers[0](x), normalisers[1](y))
+            if self.exact:  # the new transitions are inducing points too
+                model = model._replace(layers=(model.layers[0]._replace(inducing_inputs=standardised.x),))
+            self._condition(model, normalisers, standardised)
         return {}
 
     def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
@@ -158,8 +157,7 @@ class SparseGPDynamics(Learner[_Fitted]):
             return {}
         model, normalisers, posterior = self._fitted
         state: StateDict = {**model.layers[0]._asdict(), "log_noise": model.log_noise}
-        for name, normaliser in zip(_NORMALISERS, normalisers, strict=True):
-            state |= {f"{name}.{key}": value for key, value in normaliser._asdict().items()}
+        state |= normalisers_state(*normalisers)
         return state | {f"posterior.{key}": value for key, value in posterior._asdict().items()}
 
     def load_state_dict(self, state: StateDict) -> None:
@@ -176,17 +174,16 @@ class SparseGPDynamics(Learner[_Fitted]):
         received = state.get("inducing_inputs")
         count = len(received) if isinstance(received, Tensor) and received.ndim == 2 else self.num_inducing
         count = count if self.exact else min(count, self.num_inducing)
-        shapes = ((count, sizes[0]), (sizes[0],), ())
-        layer = Layer(*(take_tensor(state, *pair, device) for pair in zip(Layer._fields, shapes, strict=True)))
+        layer = take_layer(state, "", count, sizes[0], device)
         model = DeepGP((layer,), take_tensor(state, "log_noise", (sizes[1],), device))
-        inputs, targets = (
-            Normaliser(*(take_tensor(state, f"{name}.{key}", (size,), device) for key in Normaliser._fields))
-            for name, size in zip(_NORMALISERS, sizes, strict=True)
+        normalisers = (
+            take_normaliser(state, "inputs", sizes[0], device),
+            take_normaliser(state, "targets", sizes[1], device),
         )
         matrices = ((count, count), (count,), (count, sizes[1]))
         names = (f"posterior.{name}" for name in SparsePosterior._fields)
         posterior = SparsePosterior(*(take_tensor(state, *pair, device) for pair in zip(names, matrices, strict=True)))
-        self._fitted = _Fitted(model, (inputs, targets), posterior)
+        self._fitted = _Fitted(model, normalisers, posterior)
 
     def _start(self, data: Data, normalisers: tuple[Normaliser, Normaliser], generator: torch.Generator) -> DeepGP:
         """Hyperparameters of the last training in the new standardisation, or fixed ones; fresh inducing inputs."""

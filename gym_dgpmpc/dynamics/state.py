@@ -1,8 +1,10 @@
-"""Reading a saved state: every entry is checked for its name, its type and its shape before anything is replaced."""
+"""Saved states: every entry is checked for its name, its type and its shape before anything is replaced."""
 
 import torch
 from torch import Tensor
 
+from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.gp.layer import Layer
 from gym_dgpmpc.types import StateDict
 
 
@@ -23,3 +25,29 @@ def take_tensor(
     if not isinstance(value, Tensor) or value.shape != shape:
         raise ValueError(f"dynamics state {name!r}: expected a tensor of shape {shape}, received {received}")
     return value.to(device, dtype).clone()
+
+
+def normalisers_state(inputs: Normaliser, targets: Normaliser) -> StateDict:
+    """The entries "inputs.mean" to "targets.std"."""
+    pairs = (("inputs", inputs), ("targets", targets))
+    return {f"{name}.{key}": value for name, normaliser in pairs for key, value in normaliser._asdict().items()}
+
+
+def take_normaliser(state: StateDict, name: str, size: int, device: torch.device) -> Normaliser:
+    """The standardisation of ``size`` numbers whose entries begin with ``name``.
+
+    Raises:
+        ValueError: as `take_tensor`.
+    """
+    return Normaliser(*(take_tensor(state, f"{name}.{key}", (size,), device) for key in Normaliser._fields))
+
+
+def take_layer(state: StateDict, prefix: str, num_inducing: int, input_size: int, device: torch.device) -> Layer:
+    """The layer whose entries begin with ``prefix``.
+
+    Raises:
+        ValueError: as `take_tensor`.
+    """
+    shapes = ((num_inducing, input_size), (input_size,), ())
+    fields = zip(Layer._fields, shapes, strict=True)
+    return Layer(*(take_tensor(state, f"{prefix}{name}", shape, device) for name, shape in fields))

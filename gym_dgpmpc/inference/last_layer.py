@@ -52,6 +52,9 @@ def last_layer_posterior(
     Args:
         whitened: flat vector of all layers; its last layer is not used.
         weight: of each datum, N / n where the rows are a subset of the data.
+
+    Raises:
+        FactorisationError: the precision is not finite, or so large that rounding hides the prior.
     """
     last = model.layers[-1]
     hidden = propagate_inner(kernel, model, factors, model.split(whitened), x, generator)
@@ -59,7 +62,8 @@ def last_layer_posterior(
     variance = (last.variance - a.square().sum(0)).clamp_min(0.0)
     weights = weight / (variance + model.noise_variance.unsqueeze(-1))
     weighted = a * weights.unsqueeze(1)
-    # The identity bounds the eigenvalues from below by one.
-    factor = cholesky(weighted @ a.mT, torch.ones_like(weights[0, 0]), jitter=1.0)
+    prior = torch.eye(a.shape[-2], dtype=a.dtype, device=a.device)
+    # No eigenvalue lies below the prior's one, so no jitter is needed.
+    factor = cholesky(weighted @ a.mT + prior, torch.ones_like(weights[0, 0]), jitter=0.0)
     mean = torch.cholesky_solve(weighted @ y.mT.unsqueeze(-1), factor).squeeze(-1)
     return LastLayerPosterior(mean, factor)

@@ -51,6 +51,16 @@ class Trained(NamedTuple):
     """Those asked for, but for the step sizes if they had to be made smaller."""
 
 
+class Sampled(NamedTuple):
+    """The outcome of `sample_pool`."""
+
+    pool: Float[Tensor, "n V"]
+    chain: SGHMCState
+    """At the last of the samples."""
+    step_size: float
+    """The one asked for, unless it had to be made smaller."""
+
+
 def train(
     kernel: Kernel,
     model: DeepGP,
@@ -108,8 +118,8 @@ def sample_pool(
     spacing: int,
     generator: torch.Generator,
     settings: InferenceSettings,
-) -> tuple[Float[Tensor, "n V"], SGHMCState]:
-    """Posterior samples ``spacing`` steps apart, and the chain at the last of them.
+) -> Sampled:
+    """Posterior samples ``spacing`` steps apart.
 
     Begins anew with half the step size if the chain leaves what is plausible.
 
@@ -118,12 +128,13 @@ def sample_pool(
     """
     factors = factorise_all(kernel, model)
     for _ in range(MAX_ROLLBACKS + 1):
-        positions, last = [], chain
-        for last in mcem.sample(kernel, model, chain, data, num_samples, spacing, generator, settings, factors):
-            positions.append(last.position)
-        pool = torch.stack(positions)
-        if is_plausible(pool):
-            return pool, last
+        try:
+            states = list(mcem.sample(kernel, model, chain, data, num_samples, spacing, generator, settings, factors))
+            pool = torch.stack([state.position for state in states])
+        except FactorisationError:  # of an exact draw: the steps before it led to what is not finite
+            pool = None
+        if pool is not None and is_plausible(pool):
+            return Sampled(pool, states[-1], settings.step_size)
         settings = replace(settings, step_size=0.5 * settings.step_size)
     raise TrainingError(
         f"sampling the posterior diverged {MAX_ROLLBACKS + 1} times, the last time with the step size "

@@ -163,7 +163,7 @@ class CEM:
             variance = self.smoothing * variance + (1.0 - self.smoothing) * elite_variance
 
             # All that the host must know, in its one synchronisation of the iteration.
-            narrow = (variance.sqrt() < self.min_std * (high - low)).all()
+            narrow = ((variance.sqrt() < self.min_std * (high - low)) | (low == high)).all()
             value = (share * scores.masked_fill(~finite, 0.0)).sum()
             num_finite, is_narrow, expected_return = torch.stack([finite.sum(), narrow, value]).tolist()
             num_nonfinite += self.num_candidates - int(num_finite)

@@ -55,6 +55,13 @@ def test_mixed_action_bounds_name_the_ones_that_are_missing():
         agent(with_spaces(action=spaces.Box(low, high, dtype=np.float64)))
 
 
+def test_a_planner_for_other_actions_is_refused():
+    """What it plans would be broadcast to the environment's actions, and learned from without a word."""
+    three = spaces.Box(-1.0, 1.0, (3,), np.float32)
+    with pytest.raises(ValueError, match="planner plans actions of 1 numbers, the action space has 3"):
+        agent(with_spaces(action=three))
+
+
 @pytest.mark.parametrize(
     "space",
     [

@@ -237,6 +237,14 @@ def test_an_environment_whose_reset_raises_keeps_the_step_that_ended_the_episode
     assert learner.store.episodes.tolist() == [i // LENGTH for i in range(30)]
 
 
+def test_what_resampling_tells_is_logged_as_its_mean():
+    learner = agent()
+    resample, told = learner.dynamics.resample, iter([1.0, 0.0, 0.0, 1.0])
+    learner.dynamics.resample = lambda data, generator: {**resample(data, generator), "dropped": next(told)}
+    learner.learn(LENGTH + 4, log_interval=10)
+    assert learner.logger.name_to_value["train/dropped"] == pytest.approx(0.5)
+
+
 def test_training_that_fails_can_be_tried_again():
     class Failing(LinearModel):
         def fit(self, data, generator):

@@ -74,6 +74,25 @@ def test_growth_is_amortised():
     assert store.rewards.tolist() == list(range(2_000))
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("terminated", math.nan, "step 2: terminated must be true or false, got nan"),
+        ("terminated", 2, "step 2: terminated must be true or false, got 2"),
+        ("episode", 1.7, "step 2: episode must be a whole number, got 1.7"),
+        ("episode", math.nan, "step 2: episode must be a whole number, got nan"),
+    ],
+)
+def test_what_a_conversion_would_change_is_refused(name, value, message):
+    store, data = TransitionStore(S, A), rows(2)
+    store.extend(**data)
+    with pytest.raises(EnvironmentDataError, match=message):
+        store.extend(**data | {name: np.array([value, 0])})
+    assert_holds(store, data)
+    store.extend(**data | {"terminated": np.array([1.0, 0.0]), "episode": np.array([3.0, 4.0])})
+    assert store.terminated[2:].tolist() == [True, False] and store.episodes[2:].tolist() == [3, 4]
+
+
 def test_transitions_are_views_that_later_rows_do_not_change():
     store, data = TransitionStore(S, A, capacity=64), rows(50)
     store.extend(**part(slice(0, 20), data))

@@ -1,5 +1,10 @@
 """Compiled rollouts against the same functions evaluated step by step with PyTorch, in single and double precision."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -118,6 +123,29 @@ def test_any_number_of_candidates_and_threads(num_candidates):
     assert torch.equal(found[0], alone), "a candidate's trajectory depends on its neighbours"
 
 
+FORKED = """
+import multiprocessing, torch
+from tests.dynamics.test_compiled_rollout import Draw
+torch.set_num_threads(2)
+draw = Draw("rbf", 1)
+actions = draw.actions(100)
+expected = draw.compiled.trajectories(draw.observation, actions)
+def same(_): return torch.equal(draw.compiled.trajectories(draw.observation, actions), expected)
+with multiprocessing.get_context("fork").Pool(1) as pool:
+    print(pool.map_async(same, [0]).get(timeout=20))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_child_has_threads_of_its_own():
+    """The parent's are not in it, and it would wait for them for ever."""
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", FORKED], cwd=root, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.stdout == "[True]\n", done.stderr
+
+
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e30])
 def test_what_is_not_finite_never_becomes_finite(kernel, value):
@@ -138,6 +166,26 @@ def test_the_argument_may_be_a_view_of_another_precision():
     expected = draw.compiled.trajectories(draw.observation, actions)
     strided = torch.stack([actions, actions], dim=-1).double()[..., 0]
     assert torch.equal(draw.compiled.trajectories(draw.observation.double(), strided), expected)
+
+
+@pytest.mark.parametrize(
+    ("observation_size", "action_size", "horizon", "message"),
+    [
+        (2, 2, HORIZON, r"observation must have the shape \(3,\), got \(2,\)"),
+        (3, 1, HORIZON, rf"actions must have the shape \[K, H, 2\], got \(4, {HORIZON}, 1\)"),
+        (3, 2, HORIZON + 1, f"plans of at most {HORIZON} steps, got actions for {HORIZON + 1}"),
+    ],
+)
+def test_sizes_that_are_not_the_draws_are_refused(observation_size, action_size, horizon, message):
+    """The compiled code would read beyond its arrays."""
+    sampler = Draw("rbf", 1).compiled
+    with pytest.raises(ValueError, match=message):
+        sampler.trajectories(torch.zeros(observation_size), torch.zeros(4, horizon, action_size))
+
+
+def test_functions_for_a_whole_plan_serve_one_of_any_length():
+    sampler = Draw("rbf", 1, refresh="plan").compiled
+    assert sampler.trajectories(torch.zeros(3), torch.zeros(4, 2 * HORIZON, 2)).isfinite().all()
 
 
 @pytest.mark.parametrize("refresh", ["step", "plan"])

@@ -3,7 +3,10 @@
 import functools
 import os
 import stat
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import pytest
 import torch
@@ -86,10 +89,28 @@ def test_a_cache_that_others_can_write_to_is_not_used(tmp_path):
 
 
 @needs_compiler
-def test_without_a_home_it_is_built_elsewhere(tmp_path, monkeypatch):
+def test_without_a_home_it_is_built_elsewhere_and_removed_in_the_end(tmp_path):
     (tmp_path / "file").write_text("not a folder")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert compiler.load("rollout") is not None
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    program = """
+import os
+from gym_dgpmpc.dynamics import compiler
+assert compiler.load("rollout") is not None
+print(len(os.listdir(os.environ["TMPDIR"])))
+"""
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "file"), "TMPDIR": str(temporary)}
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment,
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.stdout == "1\n", done.stderr
+    assert not list(temporary.iterdir())
 
 
 def test_memory_that_cannot_be_had_is_an_error(monkeypatch):

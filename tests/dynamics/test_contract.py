@@ -16,7 +16,7 @@ from gym_dgpmpc.dynamics.ensemble_draws import PROPAGATIONS
 from gym_dgpmpc.dynamics.sparse_gp import GP_DRAWS, SparseGPDynamics
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.planning.rollout import rollout
-from gym_dgpmpc.types import DynamicsModel, TransitionSampler
+from gym_dgpmpc.types import DynamicsModel, Transitions, TransitionSampler
 from tests.oracles import linear_gaussian, slider
 from tests.oracles.models import seeded
 
@@ -119,6 +119,32 @@ def test_rollouts_have_the_states_shape_and_are_finite(name):
     assert torch.equal(states[..., 2], torch.full_like(states[..., 2], slider.CONSTANT)), "a constant passes through"
 
 
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.family != "truth"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_double_precision_draw_follows_states_of_either_precision(name, dtype):
+    model = CASES[name].make(dtype=torch.float64)
+    model.load_state_dict(trained_state(CASES[name].family))
+    sampler = model.draw(PARTICLES, HORIZON, seeded(5))
+    after = sampler(START.to(dtype).expand(PARTICLES, CANDIDATES, -1), actions()[:, 0].to(dtype), 0)
+    assert after.dtype == dtype and after.isfinite().all()
+    states = rollout(model.draw(PARTICLES, HORIZON, seeded(5)), START.to(dtype), actions(), PARTICLES)
+    assert torch.equal(states[1], after) and states.isfinite().all()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.family != "truth"])
+def test_a_candidate_that_is_not_finite_keeps_that_to_itself(name, value):
+    sampler = fitted(name).draw(PARTICLES, HORIZON, seeded(5))
+    states = START.expand(PARTICLES, CANDIDATES, -1).clone()
+    states[0, 1, 0] = value
+    after = sampler(states, actions()[:, 0], 0)
+    assert not after[:, 1].isfinite().all()
+    others = [0, 2]
+    assert after[:, others].isfinite().all()
+    if CASES[name].family.startswith("deep"):  # whose draws move particles one by one
+        assert after[1:].isfinite().all()
+
+
 def test_the_generator_decides_everything(name):
     model = fitted(name)
     torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
@@ -181,6 +207,18 @@ def test_a_state_with_a_hole_is_refused_and_changes_nothing(learner):
 def test_nothing_to_learn_from_is_an_error(learner):
     with pytest.raises(ValueError, match="0 transitions"):
         CASES[learner].make().fit(slider.transitions(0, NOISE), seeded())
+
+
+@pytest.mark.parametrize("learner", [FAMILIES["sparse"], FAMILIES["deep2"]])
+def test_the_rounding_of_a_large_number_is_not_a_target(learner):
+    """A position of 5,000 that only its last bit changes: its noise would count as much as what is to be learned."""
+    observation, action, after = slider.transitions(NUM_DATA, NOISE)
+    bits = torch.randint(-1, 2, (2, NUM_DATA), generator=seeded())
+    observation[:, 0], after[:, 0] = 5000 + bits * 2.0**-11
+    model = CASES[learner].make()
+    model.fit(Transitions(observation, action, after), seeded())
+    assert model.state_dict()["targets.std"][0] == 1.0
+    assert model.state_dict()["targets.std"][1] < 1.0
 
 
 def test_training_is_decided_by_its_generator(learner):

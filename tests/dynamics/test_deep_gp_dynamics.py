@@ -234,6 +234,8 @@ def test_a_position_outside_the_ring_is_refused(oldest):
         ({"iterations": 0}, "iterations"),
         ({"num_samples": 0}, "num_samples"),
         ({"sample_spacing": 0}, "sample_spacing"),
+        ({"resample_samples": 0}, "resample_samples must be at least 1, received 0"),
+        ({"resample_samples": -3}, "resample_samples must be at least 1, received -3"),
         ({"resample_steps": -1}, "resample_steps must be at least 0, received -1"),
         ({"draw": "thompson"}, "unknown draw 'thompson': expected one of pathwise, joint, marginal"),
         ({"refresh": "never"}, "unknown refresh 'never': expected one of step, plan"),
@@ -256,16 +258,45 @@ def test_a_training_that_diverges_leaves_the_model_as_it_was():
     assert torch.equal(predictions(model), before)
 
 
-def test_a_resampling_that_diverges_is_dropped():
-    model = fitted()
-    before = predictions(model)
-    model.inference = InferenceSettings(step_size=1e4, gibbs_every=0)
-    model.resample_steps = 50
+@pytest.mark.parametrize("gibbs_every", [20, 0])
+def test_a_resampling_that_diverges_is_dropped(gibbs_every):
+    model = fitted(inference=InferenceSettings(gibbs_every=gibbs_every), resample_steps=50)
+    before, step_size = predictions(model), model._fitted.step_size
+    model._fitted = model._fitted._replace(step_size=1e4)
     assert model.resample(pendulum.simulate(31), seeded()) == {"resamplings_dropped": 1.0}
     assert torch.equal(predictions(model), before)
-    model.inference = InferenceSettings()
+    model._fitted = model._fitted._replace(step_size=step_size)
     assert model.resample(pendulum.simulate(31), seeded()) == {"resamplings_dropped": 0.0}
     assert not torch.equal(predictions(model), before)
+
+
+def test_resampling_takes_the_steps_that_training_had_to_make_smaller():
+    """Those asked for diverge each time, and the pool would stay as it is for a whole episode."""
+    settings = {"inference": InferenceSettings(step_size=8.0), "first_iterations": 300, "resample_steps": 10}
+    model = tiny(**settings)
+    metrics = model.fit(pendulum.simulate(40), seeded())
+    assert metrics["rollbacks"] >= 1
+    assert model.state_dict()["step_size"] <= 8.0 / 2 ** metrics["rollbacks"]
+    loaded = tiny(**settings)
+    loaded.load_state_dict(model.state_dict())
+    for each in (model, loaded):
+        generator = seeded(3)
+        dropped = [each.resample(pendulum.simulate(41 + i), generator)["resamplings_dropped"] for i in range(10)]
+        assert sum(dropped) < 5
+    assert torch.equal(predictions(loaded), predictions(model))
+
+
+def test_a_state_without_a_step_size_has_the_one_asked_for():
+    """So do the states of earlier versions, and those of trainings that had no need of another."""
+    settings = {"inference": InferenceSettings(step_size=0.01)}
+    state = fitted(**settings).state_dict()
+    assert "step_size" not in state
+    model = tiny(**settings)
+    model.load_state_dict(state)
+    assert model._fitted.step_size == 0.01
+    for value in (0.0, float("nan"), "text"):
+        with pytest.raises(ValueError, match="'step_size': expected a positive number, received"):
+            model.load_state_dict(state | {"step_size": value})
 
 
 def test_resampling_encodes_the_rows_it_needs_and_no_others():

@@ -114,6 +114,26 @@ def test_within_an_episode_the_data_count_if_asked():
             assert torch.equal(model.state_dict()[name], hyperparameters[name])
 
 
+def test_the_exact_model_within_an_episode_is_exact_too():
+    """Where no transition was when it was trained, it predicts what the same hyperparameters give with all of them."""
+    grown = noisy(60, 0.02)
+    model = fitted(data=Transitions(*(field[:30] for field in grown)), exact=True, update_within_episode=True)
+    _, normalisers, _ = model._fitted
+    model.resample(grown, seeded())
+    layer, noise = model._fitted.model.layers[0], model._fitted.model.noise_variance
+    x, y = (normalise(raw) for normalise, raw in zip(normalisers, model._encode(grown), strict=True))
+    assert torch.equal(layer.inducing_inputs, x)
+    known = exact.regression("rbf", layer, noise, x, y, x)
+    mean = normalisers[1].inverse(known.mean) + grown.observation
+    std = known.covariance.diagonal(dim1=-2, dim2=-1).mT.clamp_min(0.0).sqrt() * normalisers[1].std
+    count = 2000
+    error = (one_step(model, grown, count).mean(0) - mean).abs()
+    assert bool((error <= 5 * std / count**0.5 + 1e-2 * std).all())
+    other = SparseGPDynamics(2, 1, pendulum.SPEC, exact=True, update_within_episode=True)
+    other.load_state_dict(model.state_dict())
+    assert torch.equal(one_step(other, grown, 3), one_step(model, grown, 3))
+
+
 def test_later_trainings_start_from_the_last_one():
     """One iteration from a converged model loses nothing; one from the beginning is far behind."""
     data = pendulum.simulate(80)

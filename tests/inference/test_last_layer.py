@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
 from gym_dgpmpc.gp.exact import whitened_posterior
 from gym_dgpmpc.gp.layer import Layer
@@ -66,6 +67,14 @@ def test_weight_counts_a_datum_as_often(generator):
     twice = last_layer_posterior("matern32", model, factors, start, x.repeat(2, 1), y.repeat(2, 1), generator)
     torch.testing.assert_close(weighted.mean, twice.mean)
     torch.testing.assert_close(weighted.precision_factor, twice.precision_factor)
+
+
+def test_a_precision_that_rounding_spoils_is_an_error(generator):
+    """Never a posterior under a prior that is stronger than the model's."""
+    model, (x, y) = deep_gp(1, generator), toy(generator)
+    factors = factorise_all("rbf", model)
+    with pytest.raises(FactorisationError):
+        last_layer_posterior("rbf", model, factors, torch.zeros(M * T).double(), x[:2], y[:2], generator, weight=1e19)
 
 
 def test_gibbs_step_moves_the_last_layer_alone(generator):

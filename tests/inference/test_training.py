@@ -181,7 +181,7 @@ def test_training_stops_when_held_out_data_say_that_it_is_enough():
     assert 75 < trained.num_iterations < 1500
     assert trained.num_iterations % 25 == 0
     # It stopped late enough: as good as knowing function and noise, up to what 200 observations leave unknown.
-    pool, _ = training.sample_pool("matern52", trained.model, trained.chain, data, 20, 5, seeded(), trained.settings)
+    pool, *_ = training.sample_pool("matern52", trained.model, trained.chain, data, 20, 5, seeded(), trained.settings)
     best = 2 * (-math.log(NOISE) - 0.5 * math.log(2 * math.pi * math.e))
     found = predictive_log_likelihood("matern52", trained.model, pool, waves(400, 1), seeded())
     assert best - 0.25 < found < best + 0.2
@@ -204,19 +204,21 @@ def test_held_out_rows_are_not_trained_on():
     assert training._split(Data(many, many), seeded())[1].num_rows == training.HELD_OUT[1]
 
 
-def test_sampling_that_diverges_begins_anew_with_smaller_steps():
+@pytest.mark.parametrize(("num_layers", "gibbs_every"), [(1, 0), (2, 0), (2, 20)])
+def test_sampling_that_diverges_begins_anew_with_smaller_steps(num_layers, gibbs_every):
     data = waves(40, 0)
-    model, chain = started(data, 1)
+    model, chain = started(data, num_layers)
     # A preconditioner far too large for the curvature: unstable until the step has been halved a few times.
     wild = chain._replace(square=torch.full_like(chain.square, 1e-2))
-    settings = InferenceSettings(gibbs_every=0, step_size=1.0)
-    pool, last = training.sample_pool("rbf", model, wild, data, 10, 20, seeded(), settings)
+    settings = InferenceSettings(gibbs_every=gibbs_every, step_size=1.0)
+    pool, last, step_size = training.sample_pool("rbf", model, wild, data, 10, 20, seeded(), settings)
     assert training.is_plausible(pool) and torch.equal(pool[-1], last.position)
+    assert step_size in [0.5**halvings for halvings in range(1, training.MAX_ROLLBACKS + 1)]
     with pytest.raises(
         TrainingError, match="sampling the posterior diverged 6 times, the last time with the step size"
     ):
         training.sample_pool(
-            "rbf", model, wild, data, 10, 20, seeded(), InferenceSettings(gibbs_every=0, step_size=1e3)
+            "rbf", model, wild, data, 10, 20, seeded(), InferenceSettings(gibbs_every=gibbs_every, step_size=1e3)
         )
 
 

@@ -125,6 +125,21 @@ def test_a_flat_objective_neither_moves_nor_narrows_the_plan():
     assert (plan.std - spread).abs().max() < 5 * spread / math.sqrt(400)
 
 
+def test_an_action_that_cannot_vary_does_not_keep_it_from_stopping():
+    """Its deviation is as small as it will ever be from the start."""
+
+    def distance(actions):
+        return -(actions[..., 0] - 0.2).square().sum(1)
+
+    counts, settings = [], {"horizon": 3, "num_iterations": 50}
+    for low, high in (([-1.0], [1.0]), ([-1.0, 0.1], [1.0, 0.1])):
+        cem = CEM(**bounds(low, high), **settings)
+        plan, info = cem.plan(distance, cem.initial_plan(), seeded())
+        counts.append(info.num_iterations)
+    assert max(counts) < 20
+    assert torch.equal(plan.mean[:, 1], torch.full((3,), 0.1))
+
+
 @pytest.mark.parametrize(("min_std", "expected"), [(0.0, 5), (1.0, 1)])
 def test_it_stops_when_the_plan_is_narrow(min_std, expected):
     cem = CEM(**bounds([-1.0], [1.0]), horizon=3, min_std=min_std)

@@ -236,10 +236,10 @@ void encode(const Task &task, const vec *state, const float *actions, int64_t co
   }
 }
 
-// What the outputs add to dimension i of the state, its shift included.
-inline vec added(const Task &task, const vec *out, int64_t i, int v) {
-  const vec shift = all(task.shift[i]);
-  return task.target[i] < 0 ? shift : shift + out[task.target[i] * VECTORS + v] * task.spread[i];
+// The base and what the outputs add to it in dimension i of the state, its shift included.
+inline vec with_added(const Task &task, const vec *out, int64_t i, int v, vec base) {
+  base += task.shift[i];
+  return task.target[i] < 0 ? base : base + out[task.target[i] * VECTORS + v] * task.spread[i];
 }
 
 // The next state [S, VECTORS], in place; `moved` [num_vectors, 2, VECTORS] is scratch.
@@ -250,7 +250,7 @@ void decode(const Task &task, const vec *out, vec *state, vec *moved) {
     for (int v = 0; v < VECTORS; v++) {
       const vec turn = reduced(state[vector[0] * VECTORS + v]);
       const vec cosine = cosine_of_reduced(turn), sine = sine_of_reduced(turn);
-      const vec forwards = added(task, out, vector[1], v), left = added(task, out, vector[2], v);
+      const vec forwards = with_added(task, out, vector[1], v, vec{}), left = with_added(task, out, vector[2], v, vec{});
       const vec x = state[vector[1] * VECTORS + v] * task.carried[vector[1]];
       const vec y = state[vector[2] * VECTORS + v] * task.carried[vector[2]];
       moved[2 * k * VECTORS + v] = x + (cosine * forwards - sine * left);
@@ -260,8 +260,7 @@ void decode(const Task &task, const vec *out, vec *state, vec *moved) {
   for (int64_t i = 0; i < task.observation_size; i++)
     for (int v = 0; v < VECTORS; v++) {
       vec &s = state[i * VECTORS + v];
-      s = s * task.carried[i] + task.shift[i];
-      if (task.target[i] >= 0) s += out[task.target[i] * VECTORS + v] * task.spread[i];
+      s = with_added(task, out, i, v, s * task.carried[i]);
     }
   for (int64_t k = 0; k < task.num_vectors; k++)
     for (int part = 0; part < 2; part++)
