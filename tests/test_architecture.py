@@ -12,7 +12,7 @@ MODULES = {
 }
 
 LAYERS = (
-    {"types", "errors"},
+    {"types", "errors", "checks"},
     {"envs", "wrappers"},
     {"data"},
     {"gp"},

@@ -31,6 +31,7 @@ from gym_dgpmpc.agents.task import (
     flat_size,
     wrapped_env,
 )
+from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import UnknownRewardError
 from gym_dgpmpc.types import (
@@ -90,9 +91,8 @@ class ComposedAgent(BaseAlgorithm):
         device: torch.device | str = "cpu",
         _init_setup_model: bool = True,
     ):
-        for name, count in (("learning_starts", learning_starts), ("train_freq", train_freq)):
-            if count is not None and count < 1:
-                raise ValueError(f"{name} must be at least 1, got {count}")
+        optional = {"learning_starts": learning_starts, "train_freq": train_freq}
+        check_counts(**{name: count for name, count in optional.items() if count is not None})
         if env is not None:
             env = wrapped_env(env)
         super().__init__(

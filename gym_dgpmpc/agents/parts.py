@@ -3,6 +3,7 @@
 import torch
 from gymnasium import spaces
 
+from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.planning.cem import CEM
 
 
@@ -20,6 +21,7 @@ def cem_planner(
     Raises:
         ValueError: a number is out of its range.
     """
+    check_counts(num_candidates=num_candidates)
     low, high = (
         torch.as_tensor(bound, dtype=torch.float32, device=device).flatten()
         for bound in (action_space.low, action_space.high)

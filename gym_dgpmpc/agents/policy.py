@@ -4,6 +4,7 @@ Knows nothing of learning or of the environment; the agent asks it both while it
 """
 
 import math
+import numbers
 import time
 from collections.abc import Callable
 from functools import cache
@@ -14,6 +15,7 @@ from gymnasium import spaces
 
 from gym_dgpmpc.agents.plan_state import PlanState
 from gym_dgpmpc.agents.task import Task
+from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import PlanningError
 from gym_dgpmpc.planning.rollout import rollout_objective
 from gym_dgpmpc.types import DynamicsModel, PlanInfo, Planner, TransitionSampler
@@ -45,8 +47,9 @@ class PlanningPolicy:
         device: torch.device,
         time_budget: float | None = None,
     ):
-        if time_budget is not None and not (math.isfinite(time_budget) and time_budget > 0):
-            raise ValueError(f"time_budget must be a positive number of seconds, or None, got {time_budget}")
+        is_number = isinstance(time_budget, numbers.Real)
+        if time_budget is not None and not (is_number and math.isfinite(time_budget) and time_budget > 0):
+            raise ValueError(f"time_budget must be a positive number of seconds, or None, got {time_budget!r}")
         self.time_budget = time_budget
         self.num_late = 0
         """Plans that took longer than the budget, since this object was made."""
@@ -58,8 +61,7 @@ class PlanningPolicy:
         planned, needed = self.cold.plan.mean.shape[1], math.prod(action_space.shape)
         if planned != needed:
             raise ValueError(f"the planner plans actions of {planned} numbers, the action space has {needed}")
-        if num_particles < 1:
-            raise ValueError(f"num_particles must be at least 1, got {num_particles}")
+        check_counts(num_particles=num_particles)
         if not 1 <= actions_per_plan <= self.horizon:
             raise ValueError(
                 f"actions_per_plan must lie in 1 to the planner's horizon {self.horizon}, got {actions_per_plan}"
@@ -114,7 +116,8 @@ class PlanningPolicy:
             except PlanningError as error:
                 raise PlanningError(f"{error}; planning started from the observation {observation}") from error
             self.num_late += time.perf_counter() > deadline
-        action = plan.mean[age].clamp(self._low, self._high).cpu().numpy()
+        # In the precision in which it is stored, so that performing it again is the same.
+        action = plan.mean[age].float().clamp(self._low, self._high).cpu().numpy()
         age += 1
         carried = PlanState(plan, age) if age < self.actions_per_plan else PlanState(self.planner.shift(plan, age))
         return action, carried, info

@@ -16,6 +16,7 @@ from gym_dgpmpc.agents.resuming import resume_agent
 from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
 from gym_dgpmpc.agents.saving import collect
 from gym_dgpmpc.agents.stopping import StopRequests
+from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import CheckpointError, ReliabilityWarning
 
 
@@ -48,8 +49,8 @@ class Safeguard:
         resume: bool,
         checkpoint_every: int | None,
     ):
-        if checkpoint_every is not None and checkpoint_every < 1:
-            raise ValueError(f"checkpoint_every must be at least 1, got {checkpoint_every}")
+        if checkpoint_every is not None:
+            check_counts(checkpoint_every=checkpoint_every)
         self.agent, self.run_folder, self.resume, self.every = agent, run_folder, resume, checkpoint_every
         self.stop = StopRequests()
         self._stack = ExitStack()

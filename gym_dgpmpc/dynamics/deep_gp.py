@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics import compiled_rollout
 from gym_dgpmpc.dynamics.coordinates import Coordinates
@@ -28,7 +29,7 @@ from gym_dgpmpc.dynamics.deep_gp_draws import (
     Refresh,
 )
 from gym_dgpmpc.dynamics.deep_gp_start import initial_model, relocate, restandardise
-from gym_dgpmpc.dynamics.learner import Learner, check_counts
+from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
 from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all

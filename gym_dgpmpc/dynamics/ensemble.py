@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.ensemble_draws import PROPAGATIONS, CollapsedEnsemble, EnsembleSampler, Propagation
@@ -24,7 +25,7 @@ from gym_dgpmpc.dynamics.ensemble_network import (
     predict,
 )
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
-from gym_dgpmpc.dynamics.learner import Learner, check_counts
+from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.state import take_normaliser, take_tensor
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 

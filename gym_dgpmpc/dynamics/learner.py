@@ -63,14 +63,3 @@ class Learner(Generic[Fitted]):
         if self._fitted is None:
             raise RuntimeError(f"cannot {verb}: the dynamics model has not been fitted to any data yet")
         return self._fitted
-
-
-def check_counts(**counts: int) -> None:
-    """Refuse settings that count something and are less than one.
-
-    Raises:
-        ValueError: naming the setting and its value.
-    """
-    for name, value in counts.items():
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, received {value}")

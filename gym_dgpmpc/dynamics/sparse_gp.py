@@ -12,11 +12,12 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
+from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp_start import NOISE_VARIANCE, restandardise
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
-from gym_dgpmpc.dynamics.learner import Learner, check_counts
+from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.moment_matching import MomentMatchingSampler
 from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
 from gym_dgpmpc.gp.deep_gp import DeepGP

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import PlanningError
 from gym_dgpmpc.types import Objective, Plan, PlanInfo
 
@@ -82,9 +83,9 @@ class CEM:
         min_std: float = 0.005,
     ):
         _check_bounds(action_low, action_high)
-        for name, count in (("horizon", horizon), ("num_elites", num_elites), ("num_iterations", num_iterations)):
-            if count < 1:
-                raise ValueError(f"{name} must be at least 1, got {count}")
+        check_counts(
+            horizon=horizon, num_candidates=num_candidates, num_elites=num_elites, num_iterations=num_iterations
+        )
         if num_elites > num_candidates:
             raise ValueError(f"num_elites must not exceed num_candidates, got {num_elites} of {num_candidates}")
         if not 0.0 <= smoothing < 1.0:

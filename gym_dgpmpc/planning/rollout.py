@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.types import Objective, RewardFn, TerminatedFn, TrajectorySampler, TransitionSampler
 
 
@@ -101,8 +102,7 @@ def rollout_objective(
     Raises:
         ValueError: ``num_particles`` is not positive or ``observation`` not a floating-point vector.
     """
-    if num_particles < 1:
-        raise ValueError(f"num_particles must be at least 1, got {num_particles}")
+    check_counts(num_particles=num_particles)
     if observation.ndim != 1 or not observation.is_floating_point():
         raise ValueError(
             f"observation must be a floating-point vector, got shape {tuple(observation.shape)}, {observation.dtype}"

@@ -231,7 +231,7 @@ def test_a_damaged_count_is_named(num_updates):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"num_members": 0}, "num_members must be at least 1, received 0"),
+        ({"num_members": 0}, "num_members must be at least 1, got 0"),
         ({"num_hidden_layers": 0}, "num_hidden_layers must be at least 1"),
         ({"hidden_size": 0}, "hidden_size"),
         ({"batch_size": 0}, "batch_size"),

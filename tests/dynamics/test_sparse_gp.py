@@ -148,8 +148,8 @@ def test_later_trainings_start_from_the_last_one():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"num_inducing": 0}, "num_inducing must be at least 1, received 0"),
-        ({"max_iterations": 0}, "max_iterations must be at least 1, received 0"),
+        ({"num_inducing": 0}, "num_inducing must be at least 1, got 0"),
+        ({"max_iterations": 0}, "max_iterations must be at least 1, got 0"),
         ({"draw": "TS1"}, "unknown draw 'TS1': expected one of DS, MM, AMM"),
         ({"kernel": "cubic"}, "unknown kernel 'cubic'"),
         ({"kernel": "matern32", "draw": "AMM"}, "AMM has closed forms for the kernel 'rbf' only, received 'matern32'"),
