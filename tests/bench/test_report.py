@@ -132,8 +132,8 @@ def test_tasks_and_references_can_be_chosen(folder, tmp_path):
         ResultError, match="has no runs of Ant-v5; there are runs of ModCartPole-v0, Alone-v0, Fetch-v4"
     ):
         write_report(folder, tmp_path / "out", tasks=["Ant-v5"])
-    with pytest.raises(ValueError, match="no run is of the method 'PETS'"):
-        write_report(folder, tmp_path / "out", reference="PETS")
+    with pytest.raises(ValueError, match="a setting of DGP-MPC that has runs, got 'SAC'"):
+        write_report(folder, tmp_path / "out", reference="SAC")
     with pytest.raises(ValueError, match="a threshold is given for Ant-v5"):
         write_report(folder, tmp_path / "out", thresholds={"Ant-v5": 1.0})
 
@@ -187,4 +187,6 @@ def test_command_without_results(command, tmp_path):
 def test_command_with_a_method_that_was_not_run(command, folder, tmp_path):
     result = command(folder, "--out", tmp_path / "out", "--reference", "PETS")
     assert result.exit_code == 2
-    assert result.stderr.startswith("error: no run is of the method 'PETS'; there are DGP-MPC")
+    assert result.stderr.startswith(
+        "error: the reference is a setting of DGP-MPC that has runs, got 'PETS'; there are DGP-MPC"
+    )

@@ -68,8 +68,11 @@ def test_reference_is_chosen_by_its_runs_and_not_by_its_returns():
     # one has the most tasks, although two has as many runs; where it is, it stands.
     assert scores.reference_of(study) == {"a": one, "b": one, "c": one}
     assert scores.reference_of(study, two) == {"a": two, "b": two, "c": one}
-    with pytest.raises(ValueError, match=r"no run is of the method 'DGP'; there are DGP-MPC L=1 rbf, .*, SAC"):
-        scores.reference_of(study, "DGP")
+    for name in ("DGP", "SAC", "DGP-MPC L=4 rbf"):
+        with pytest.raises(ValueError, match=rf"got '{name}'; there are {one}, {two}, {three}$"):
+            scores.reference_of(study, name)
+    with pytest.raises(ValueError, match=r"there are none$"):
+        scores.reference_of({"d": study["d"]}, "SAC")
     # As many tasks and runs: the deeper one.
     assert scores.reference_of({"c": study["c"]}) == {"c": three}
 
