@@ -123,6 +123,7 @@ class ContactResult:
         """Write the file of this run in ``folder``, whole or not at all.
 
         Raises:
+            ValueError: a number is not finite.
             OSError: it cannot be written.
         """
         content = {"schema": SCHEMA, **asdict(self), "key": self.key._asdict()}
