@@ -35,6 +35,8 @@ class Threshold(NamedTuple):
 
     value: float
     origin: str
+    is_scaled: bool = False
+    """Whether it was worked out from the runs themselves, as a share of the way to the ceiling."""
 
 
 def load_runs(folder: Path) -> dict[str, dict[str, list[RunResult]]]:
@@ -187,9 +189,8 @@ def threshold_of(task: str, runs: Runs, given: Mapping[str, float]) -> Threshold
     scale = scale_of(runs)
     if scale is None:
         return None
-    return Threshold(
-        scale[0] + NEAR * (scale[1] - scale[0]), f"{NEAR:.0%} of the way from random actions to the ceiling"
-    )
+    origin = f"{NEAR:.0%} of the way from random actions to the ceiling"
+    return Threshold(scale[0] + NEAR * (scale[1] - scale[0]), origin, is_scaled=True)
 
 
 def _each(

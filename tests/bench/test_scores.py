@@ -125,11 +125,13 @@ def test_scale_goes_from_random_actions_to_the_ceiling():
 def test_threshold_comes_from_the_first_source_that_has_one():
     plain = {"A": [run("A", [1.0])]}
     scaled = {"A": [run("A", [1.0], random=0.0)], "true dynamics": [run("true dynamics", [100.0])]}
-    assert scores.threshold_of("ModCartPole-v0", plain, {"ModCartPole-v0": 3.0}) == (3.0, "as given")
+    assert scores.threshold_of("ModCartPole-v0", plain, {"ModCartPole-v0": 3.0}) == (3.0, "as given", False)
     assert scores.threshold_of("ModCartPole-v0", plain, {}).value == 149.81
     assert scores.threshold_of("BiasedReacher-v0", plain, {}).value == -39.89
     assert scores.threshold_of("InvertedPendulum-v5", scaled, {}).value == 950.0
     assert scores.threshold_of("Pendulum-v1", scaled, {}).value == pytest.approx(90.0)
+    assert scores.threshold_of("Pendulum-v1", scaled, {}).is_scaled
+    assert not scores.threshold_of("InvertedPendulum-v5", scaled, {}).is_scaled
     assert scores.threshold_of("Pendulum-v1:learned reward", scaled, {}).value == pytest.approx(90.0)
     assert scores.threshold_of("Pendulum-v1", plain, {}) is None
 
