@@ -62,7 +62,7 @@ def test_what_lies_far_below_is_cut_off_and_said(drawn, tmp_path):
         -60.0
     )  # the usual lowest is -50, half of its distance from the top below
     assert axes.get_ylim()[1] > -30.0
-    assert axes.get_xlabel().endswith("\n(1 curve starts lower, from −1,400)")
+    assert axes.get_xlabel().endswith("\n(1 curve goes lower, to −1,400)")
     np.testing.assert_array_equal(lines_of(axes)["SAC"].get_ydata(), [-1400, -900])  # cut by the axis, not changed
 
 
