@@ -21,6 +21,7 @@ from gym_dgpmpc.bench.contact_scores import crps
 from gym_dgpmpc.bench.jobs import Folders, Job, carry_out
 from gym_dgpmpc.bench.suites import ContactSuite, Narrowed, SuiteError
 from gym_dgpmpc.cli import app
+from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.envs.mod_cartpole import ModCartPoleEnv
 from tests.bench.contact_runs import TINY, made_up
@@ -54,6 +55,27 @@ def test_a_run_scores_what_it_keeps():
     assert result.counts["after"] == trial.in_contact[:, 0].astype(int).tolist()
     assert result.test_contact == 1.0 and result.training_contact > 0.7
     assert result.training["iterations"] == TINY.first_iterations and result.fit_seconds > 0
+
+
+@pytest.mark.parametrize("key", [ContactKey("a", "matern12", 3, 0), ContactKey("b", "rbf", 2, 1)])
+@pytest.mark.parametrize("patience", [None, 7])
+def test_a_run_trains_the_model_of_its_key_and_settings(monkeypatch, key, patience):
+    class Trained(Exception):
+        """Enough seen."""
+
+    def fit(model, *_):
+        raise Trained(model)
+
+    monkeypatch.setattr(DeepGPDynamics, "fit", fit)
+    settings = replace(TINY, patience=patience)
+    with pytest.raises(Trained) as seen:
+        ContactRun(key, settings).measure()
+    (model,) = seen.value.args
+    assert (model.kernel, model.num_layers) == (key.kernel, key.num_layers)
+    assert model.draw_kind == "marginal"  # the paper's law
+    assert (model.inference.patience, model.dtype) == (patience, torch.float64)
+    for name in ("num_inducing", "first_iterations", "num_samples", "sample_spacing"):
+        assert getattr(model, name) == getattr(settings, name)
 
 
 def test_a_study_is_narrowed_as_every_suite_and_its_seeds_come_outermost():

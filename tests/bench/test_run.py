@@ -262,8 +262,9 @@ def test_a_result_of_another_machine_is_kept(folders, tmp_path):
     assert run.is_finished(folders.results)
 
 
-def test_model_free_methods_learn_of_the_risk_that_planners_plan_with():
-    task = TASKS["RiskSensitiveHalfCheetah-v0"]
+@pytest.mark.parametrize("name", [name for name in TASKS if name.startswith("RiskSensitiveHalfCheetah")])
+def test_model_free_methods_learn_of_the_risk_that_planners_plan_with(name):
+    task = TASKS[name]
     for is_model_free in (True, False):
         env = task.make(model_free=is_model_free)
         assert env.get_wrapper_attr("plans_with_another_reward") != is_model_free
