@@ -11,16 +11,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy import ndarray
 
-from gym_dgpmpc.agents.files import replace_file
 from gym_dgpmpc.bench import paper, scores
 from gym_dgpmpc.bench.curves import Clock, Curve, Earned, curve, line
 from gym_dgpmpc.bench.scores import CEILING, Runs
 from gym_dgpmpc.bench.styles import Style, styles
+from gym_dgpmpc.reporting.figures import write_figure
 
 CEILING_LABEL = "planner with the true dynamics"
 COLUMNS = 3
 """Panels beside each other, as many as are readable at the width of a page; four are two rows of two."""
 
+DPI = 160
 PANEL = (3.3, 2.6)
 """Width and height of a panel with its labels, in inches."""
 
@@ -57,7 +58,7 @@ def plot_tasks(
     for axes in grid[::columns]:
         axes.set_ylabel(EARNED[earned])
     _add_legend(figure, grid, _counts(tasks, study))
-    _write(figure, path)
+    write_figure(figure, path, dpi=DPI)
 
 
 def plot_clocks(methods: Sequence[str], task: str, runs: Runs, reference: str | None, path: Path) -> None:
@@ -70,7 +71,7 @@ def plot_clocks(methods: Sequence[str], task: str, runs: Runs, reference: str | 
     grid[0].set_ylabel(EARNED["return"])
     figure.suptitle(task, fontsize="medium")
     _add_legend(figure, grid, _counts({task: methods}, {task: runs}))
-    _write(figure, path)
+    write_figure(figure, path, dpi=DPI)
 
 
 def plot_settings(task: str, runs: Runs, path: Path) -> None:
@@ -99,7 +100,7 @@ def plot_settings(task: str, runs: Runs, path: Path) -> None:
         axes.set_ylabel(EARNED["return"])
     figure.suptitle(task, fontsize="medium")
     _add_legend(figure, grid, {f"L = {depth}": "" for depth in depths})
-    _write(figure, path)
+    write_figure(figure, path, dpi=DPI)
 
 
 def plot_variability(
@@ -124,7 +125,7 @@ def plot_variability(
         axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.grid(axis="x", alpha=0.3)
     _add_legend(figure, grid, {})
-    _write(figure, path)
+    write_figure(figure, path, dpi=DPI)
 
 
 def _draw_deviation(axes: Axes, row: int, values: Float[ndarray, " n"], look: Style, floor: float) -> None:
@@ -183,8 +184,8 @@ def _cut_off(axes: Axes, drawn: Sequence[Curve], ceiling: float | None) -> str:
     if not below:
         return ""
     axes.set_ylim(floor, top + 0.06 * (top - floor))
-    curves = "1 curve starts" if below == 1 else f"{below} curves start"
-    return f"\n({curves} lower, from {min(lowest):,.0f})".replace("-", "−")
+    curves = "1 curve goes" if below == 1 else f"{below} curves go"
+    return f"\n({curves} lower, to {min(lowest):,.0f})".replace("-", "−")
 
 
 def _floor(values: Sequence[float], top: float | None) -> float:
@@ -253,8 +254,3 @@ def _add_legend(figure: Figure, grid: Sequence[Axes], notes: Mapping[str, str]) 
 def _legend_width(texts: Sequence[str], columns: int) -> float:
     """Roughly, in inches: of texts that fill one column after the other."""
     return sum(0.6 + 0.067 * max(map(len, column)) for column in np.array_split(texts, columns))
-
-
-def _write(figure: Figure, path: Path) -> None:
-    """The picture, whole or not at all; the same numbers give the same file."""
-    replace_file(path, lambda file: figure.savefig(file, format="png", dpi=160, metadata={"Software": None}))

@@ -51,8 +51,7 @@ class ContactRun:
     @property
     def name(self) -> str:
         """On one line, for a person."""
-        case, kernel, num_layers, seed = self.key
-        return f"contact study, case {case} | {kernel}, L={num_layers} | seed {seed}"
+        return f"{self.key.task} | {self.key.method} | seed {self.key.seed}"
 
     @property
     def file_name(self) -> str:

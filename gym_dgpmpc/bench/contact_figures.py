@@ -13,9 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy import ndarray
 
+from gym_dgpmpc.bench import paper
 from gym_dgpmpc.bench.contact_data import find_case
 from gym_dgpmpc.bench.contact_results import QUANTITIES, UNITS, ContactResult
 from gym_dgpmpc.bench.contact_scores import LEVELS, coverage_name
+from gym_dgpmpc.reporting.figures import write_figure
 
 Setting = tuple[str, int]
 """Kernel and number of layers."""
@@ -25,7 +27,7 @@ Curve = tuple[Float[ndarray, " H"], Float[ndarray, " H"], Float[ndarray, " H"]]
 
 SAMPLE_COLOUR, TRUTH_COLOUR = "tab:blue", "tab:red"
 
-KERNEL_NAMES = {"rbf": "RBF", "matern52": "Matérn-5/2", "matern32": "Matérn-3/2", "matern12": "Matérn-1/2"}
+KERNEL_NAMES = {**paper.KERNELS, "rbf": "RBF"}
 """From smooth to rough."""
 
 KERNEL_COLOURS = dict(zip(KERNEL_NAMES, ("#0072B2", "#009E73", "#E69F00", "#D55E00"), strict=True))
@@ -63,7 +65,7 @@ def plot_fans(results: Mapping[Setting, ContactResult], path: Path) -> None:
         fontsize="medium",
     )
     _legend_below(figure, grid[0, 0])
-    figure.savefig(path, dpi=130)
+    write_figure(figure, path, dpi=130)
 
 
 def plot_scores_by_step(curves: Mapping[str, Mapping[Setting, Curve]], quantity: str, title: str, path: Path) -> None:
@@ -95,7 +97,7 @@ def plot_scores_by_step(curves: Mapping[str, Mapping[Setting, Curve]], quantity:
     _label_grid(grid, [], layers, "")
     figure.suptitle(title, fontsize="medium")
     _legend_below(figure, grid[0, 0])
-    figure.savefig(path, dpi=130)
+    write_figure(figure, path, dpi=130)
 
 
 def _rows_and_columns(settings: Mapping[Setting, object]) -> tuple[list[str], list[int]]:

@@ -19,6 +19,7 @@ from gym_dgpmpc.bench.contact_figures import KERNEL_NAMES, Curve, Setting, plot_
 from gym_dgpmpc.bench.contact_results import QUANTITIES, QUANTITY, UNITS, ContactResult, read_contact_results
 from gym_dgpmpc.bench.contact_scores import LEVELS, SCORES, coverage_name
 from gym_dgpmpc.bench.markdown import page_and_folder, table
+from gym_dgpmpc.bench.provenance import SECTION, pairs
 from gym_dgpmpc.bench.statistics import Estimate
 
 COMMAND = "dgpmpc bench contact"
@@ -244,21 +245,17 @@ def _provenance(results: Sequence[ContactResult]) -> list[str]:
     times = ", ".join(f"{np.median(seconds):.0f} s at L = {depth}" for depth, seconds in fits.items())
     seeds = ", ".join(map(str, sorted({result.key.seed for result in results})))
     return [
-        "## What the runs were made with",
+        f"## {SECTION}",
         "",
         f"- {len(results)} runs, seeds {seeds}; the fans show the first of them",
-        f"- settings: {', '.join(f'{name} {value}' for name, value in vars(results[0].settings).items())}",
+        f"- settings: {pairs(vars(results[0].settings).items())}",
         f"- median CPU time of a training: {times}",
         f"- command: `{COMMAND}`",
         f"- revisions: {different([str(fact['revision']) for fact in facts])}",
-        f"- versions: {different([_pairs(fact['versions']) for fact in facts])}",
-        f"- machines: {different([_pairs(fact['machine']) for fact in facts])}",
+        f"- versions: {different([pairs(fact['versions'].items()) for fact in facts])}",
+        f"- machines: {different([pairs(fact['machine'].items()) for fact in facts])}",
     ]
 
 
 def _depths(results: Sequence[ContactResult]) -> list[int]:
     return sorted({result.key.num_layers for result in results})
-
-
-def _pairs(values: Mapping[str, object]) -> str:
-    return ", ".join(f"{name} {value}" for name, value in values.items())

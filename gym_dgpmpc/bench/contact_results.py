@@ -44,6 +44,16 @@ class ContactKey(NamedTuple):
     seed: int
 
     @property
+    def task(self) -> str:
+        """What the command line calls its case."""
+        return f"case {self.case}"
+
+    @property
+    def method(self) -> str:
+        """What the command line calls its model."""
+        return f"DGP L={self.num_layers} {self.kernel}"
+
+    @property
     def file_name(self) -> str:
         return f"contact_{self.case}_{self.kernel}_L{self.num_layers}_seed{self.seed}.json"
 
@@ -123,6 +133,7 @@ class ContactResult:
         """Write the file of this run in ``folder``, whole or not at all.
 
         Raises:
+            ValueError: a number is not finite.
             OSError: it cannot be written.
         """
         content = {"schema": SCHEMA, **asdict(self), "key": self.key._asdict()}

@@ -2,7 +2,7 @@
 
 A worker that dies takes no job with it: the job is given to another worker, where it goes on from its checkpoint if
 both see the same folder, and begins anew if not. Results come back with the outcome, so a cluster needs no shared
-folder.
+folder, and a job whose file in this machine's folder is something else's fails here.
 """
 
 import logging
@@ -14,7 +14,7 @@ from typing import Any
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-from gym_dgpmpc.bench.jobs import Folders, Job, Outcome, carry_out, failed
+from gym_dgpmpc.bench.jobs import Folders, Job, Outcome, carry_out, failed, refusal
 from gym_dgpmpc.errors import DGPMPCError
 
 RETRIES = 10
@@ -44,6 +44,30 @@ def executor(num_processes: int, cluster: str | None = None) -> Executor:
     Raises:
         ClusterError: the address is of none of these forms, or what it needs is not installed.
     """
+    return refusing(_executor_at(cluster, num_processes))
+
+
+def refusing(carry_out_all: Executor) -> Executor:
+    """The same, but a job whose file is something else's fails at once and is given to no worker.
+
+    A worker with folders of its own does not see that file, and what it sends back would replace it.
+    """
+
+    def carry_out_allowed(jobs: Sequence[Job], folders: Folders) -> Iterator[tuple[Job, Outcome]]:
+        allowed = []
+        for job in jobs:
+            outcome = refusal(job, folders.results)
+            if outcome is None:
+                allowed.append(job)
+            else:
+                yield job, outcome
+        if allowed:
+            yield from carry_out_all(allowed, folders)
+
+    return carry_out_allowed
+
+
+def _executor_at(cluster: str | None, num_processes: int) -> Executor:
     if cluster is None:
         return lambda jobs, folders: _on_this_machine(jobs, folders, num_processes)
     if cluster == "ray" or cluster.startswith("ray://"):

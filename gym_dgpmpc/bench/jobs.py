@@ -65,13 +65,26 @@ def failed(error: BaseException) -> Outcome:
 
 
 def carry_out(job: Job, folders: Folders) -> Outcome:
-    """Do a job, unless it is finished; no failure of it is an exception."""
+    """Do a job on one thread, unless it is finished; no failure of it is an exception."""
+    import torch  # which takes seconds to import
+
+    # As many jobs run beside each other as there are cores, and sums do not depend on how many these are.
+    torch.set_num_threads(1)
     try:
         path = folders.results / job.file_name
         told = "finished already" if job.is_finished(folders.results) else job.perform(folders)
         return Outcome(told, path.read_text())
     except Exception as error:
         return failed(error)
+
+
+def refusal(job: Job, results: Path) -> Outcome | None:
+    """The outcome of a job that must not be done because its file is something else's; None if it may be done."""
+    try:
+        job.is_finished(results)
+    except DGPMPCError as error:
+        return failed(error)
+    return None
 
 
 def log_of(job: Job, results: Path) -> Path:
@@ -97,12 +110,5 @@ def keep(job: Job, outcome: Outcome, results: Path) -> None:
 
 
 def unfinished(jobs: Sequence[Job], results: Path) -> list[Job]:
-    """Those that are left to do, in their order; one whose file is something else's is among them, and will fail."""
-
-    def is_left(job: Job) -> bool:
-        try:
-            return not job.is_finished(results)
-        except DGPMPCError:
-            return True
-
-    return [job for job in jobs if is_left(job)]
+    """Those that are left to do, in their order; one whose file is something else's is among them, to fail."""
+    return [job for job in jobs if refusal(job, results) is not None or not job.is_finished(results)]

@@ -96,12 +96,12 @@ class ModelFreeMethod:
     is_model_free: ClassVar[bool] = True
 
     def settings(self, task: Task, **asked: Any) -> Settings:
-        """Every argument on this task that is a plain value, and what its environment was told.
+        """Every argument on this task that is a plain value, and what its environment is told, which the task decides.
 
         Raises:
-            ValueError: there is no argument of a name that is asked for.
+            ValueError: the algorithm has no argument of a name that is asked for.
         """
-        return _complete(self.name, _defaults(self.algorithm), {**self.fitted(task), **task.for_model_free}, asked)
+        return {**_complete(self.name, _defaults(self.algorithm), self.fitted(task), asked), **task.for_model_free}
 
     def make(self, env: gymnasium.Env, settings: Settings, seed: int) -> BaseAlgorithm:
         """The algorithm, on the CPU and silent."""

@@ -16,7 +16,7 @@ TRIALS = 10
 """Independent trials of each cell."""
 
 EPISODES: Mapping[str, int] = {"ModCartPole-v0": 15, "BiasedReacher-v0": 15, "RiskSensitiveHalfCheetah-v0": 10}
-"""Episodes that a trial's average is over, by task."""
+"""Episodes that a trial's average is over, by task: all that are played after a random one."""
 
 VARIANCE_EPISODES = 10
 """Episodes that the averages of the paper's variance figure are over, for every task."""

@@ -52,7 +52,7 @@ class Origins:
             started = sorted({result.started[:10] for result in results})
             rows.append([
                 self._letters[origin], str(len(results)), _commands(results), f"`{cell(origin.revision)}`",
-                _pairs(pair for pair in (*origin.versions, *origin.machine) if pair not in shared) or NOTHING,
+                pairs(pair for pair in (*origin.versions, *origin.machine) if pair not in shared) or NOTHING,
                 " to ".join(dict.fromkeys((started[0], started[-1]))),
             ])  # fmt: skip
         differing = _differing(list(self._letters))
@@ -60,7 +60,7 @@ class Origins:
             f"## {SECTION}",
             "",
             f"Not the same in all runs: {differing}." if differing else "All runs have the same revision and versions.",
-            *([f"The same in all: {_pairs(sorted(shared))}."] if shared else []),
+            *([f"The same in all: {pairs(sorted(shared))}."] if shared else []),
             "Each run's own command, with its seed and all its settings, is in its file.",
             "",
             *table(["", "runs", "commands", "revision", "other versions or machine", "started"], rows),
@@ -114,7 +114,8 @@ def _sorted(values: Mapping[str, object]) -> tuple[tuple[str, str], ...]:
     return tuple(sorted((str(name), str(value)) for name, value in values.items()))
 
 
-def _pairs(values: Iterable[tuple[str, str]]) -> str:
+def pairs(values: Iterable[tuple[str, object]]) -> str:
+    """ "cores 2, python 3.11", for a cell of a table."""
     return cell(", ".join(f"{name} {value}" for name, value in values))
 
 

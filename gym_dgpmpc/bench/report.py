@@ -109,7 +109,7 @@ def _add_overview(page: _Page, study: Mapping[str, Runs], references: Mapping[st
     drawn = {task: scores.compared(runs, references.get(task)) for task, runs in study.items()}
     drawn = {task: methods for task, methods in drawn.items() if len(methods) > 1}
     if drawn:
-        of = {task: {method: study[task][method] for method in methods} for task, methods in drawn.items()}
+        of = _only(study, drawn, CEILING)
         page.add("## All methods")
         charts.plot_tasks(drawn, study, references, page.place("comparison"), "return")
         page.show("Return of each method on each task", of, _curve_caption("Return of an episode"))
@@ -121,22 +121,25 @@ def _add_overview(page: _Page, study: Mapping[str, Runs], references: Mapping[st
             f"Each run's average return over its first {paper.VARIANCE_EPISODES} episodes (small dots), their mean and "
             "standard deviation over seeds; a number with an arrow stands for a mean off the axis.",
         )  # fmt: skip
+        several = {task: study[task] for task in drawn}
         page.table(
-            tables.overall_improvement_table({task: study[task] for task in drawn}, references), of,
+            tables.overall_improvement_table(several, references),
+            _only(study, tables.compared_on_several_tasks(several, references)),
             f"Probability that a run of {scores.OURS} has a higher mean return than a run of Y at equal steps (0.5: as "
             "often as not), averaged over the tasks that both have.",
         )  # fmt: skip
-        for over, lines in tables.aggregate_tables({task: study[task] for task in drawn}, references).items():
+        for over, lines in tables.aggregate_tables(several, references).items():
             page.table(
-                lines, of,
-                f"Mean return at equal steps over {', '.join(over)}, scaled per task: 0 is what random actions earn, 1 "
-                "what the planner with the true dynamics does.",
+                lines, {task: study[task] for task in over},  # every run of a task has its part in the scale
+                f"Mean return at equal steps over {', '.join(over)}, scaled per task: 0 is what random actions earn in "
+                "the first episodes of all its runs, 1 what the planner with the true dynamics does.",
             )  # fmt: skip
-    own = {
-        task: {m: r for m, r in study[task].items() if scores.setting_of(m)}
-        for task in paper.AVERAGE_RETURN
+    settings = {
+        task: [method for method in study[task] if scores.setting_of(method) in cells]
+        for task, cells in paper.AVERAGE_RETURN.items()
         if task in study
     }
+    own = _only(study, {task: methods for task, methods in settings.items() if methods})
     lines = tables.paper_table(own)
     if lines:
         page.add("## The paper's table")
@@ -156,25 +159,28 @@ def _add_task(page: _Page, task: str, runs: Runs, reference: str | None, thresho
         methods = [method for method in runs if method != CEILING]
     if methods:
         charts.plot_clocks(methods, task, runs, reference, page.place(f"{task}_learning"))
-        page.show(f"Learning curves on {task}", of, _curve_caption("Return of an episode"))
+        page.show(
+            f"Learning curves on {task}", _only(of, {task: methods}, CEILING), _curve_caption("Return of an episode")
+        )
     settings = [method for method in runs if scores.setting_of(method)]
     if len(settings) > 1:
         charts.plot_settings(task, runs, page.place(f"{task}_settings"))
         page.show(
-            f"Depths and kernels on {task}", {task: {method: runs[method] for method in settings}},
+            f"Depths and kernels on {task}", _only(of, {task: settings}, CEILING),
             "Return of an episode with every depth and kernel: single runs thin, their mean thick.",
         )  # fmt: skip
-    steps = scores.common_steps(runs)
+    steps, at_equal_steps = scores.common_steps(runs), [*tables.at_equal_steps(runs)[0]]
     page.table(
-        tables.comparison_table(runs), of,
+        tables.comparison_table(runs), _only(of, {task: at_equal_steps}, CEILING),
         f"Each run's average return over the episodes that ended within {steps:,} environment steps, as many as "
         "all runs have.",
     )  # fmt: skip
-    without = [m for m in runs if m != CEILING and m not in tables.at_equal_steps(runs)[0]]
+    without = [m for m in runs if m not in (CEILING, *at_equal_steps)]
     if without:
         page.add(f"Not in the table, for a run without an episode by then: {', '.join(without)}.")
     page.table(
-        tables.improvement_table(runs, reference), of,
+        tables.improvement_table(runs, reference),
+        _only(of, {task: tables.compared_at_equal_steps(runs, reference)}),
         "Probability that a run of the first has a higher mean return than a run of Y within these steps (0.5: as "
         "often as not), and the two-sided Mann-Whitney test's p, which for 3 runs against 3 cannot be less than 0.1.",
     )  # fmt: skip
@@ -182,15 +188,29 @@ def _add_task(page: _Page, task: str, runs: Runs, reference: str | None, thresho
     threshold = scores.threshold_of(task, runs, thresholds)
     if threshold is not None and methods:
         page.table(
-            tables.threshold_table(runs, threshold), of,
+            tables.threshold_table(runs, threshold),
+            of if threshold.is_scaled else _only(of, {task: [method for method in runs if method != CEILING]}),
             f"Environment steps until an episode's return first reached {tables.number(threshold.value)} "
             f"({threshold.origin}). A run that never did is censored at its end.",
         )  # fmt: skip
-    page.table(tables.success_table(runs), of, f"Share of successful episodes within {steps:,} environment steps.")
+    told = [method for method in at_equal_steps if scores.success_rates(runs[method], steps) is not None]
+    page.table(
+        tables.success_table(runs),
+        _only(of, {task: told}),
+        f"Share of successful episodes within {steps:,} environment steps.",
+    )
     page.table(
         tables.time_table(runs), of,
         "Wall-clock time with everything that a run does, and of choosing one action; runs may share a machine.",
     )  # fmt: skip
+
+
+def _only(study: Mapping[str, Runs], methods: Mapping[str, Sequence[str]], *more: str) -> dict[str, Runs]:
+    """The runs of the methods of each task, and of ``more`` where they were run."""
+    return {
+        task: {method: study[task][method] for method in [*named, *more] if method in study[task]}
+        for task, named in methods.items()
+    }
 
 
 def _curve_caption(what: str) -> str:

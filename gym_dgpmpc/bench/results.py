@@ -67,6 +67,8 @@ class RunResult:
         revision: of this package's source, with "-dirty" if it was changed; "unknown" without one.
         versions: of Python and the packages used.
         machine: system, processor, cores, threads.
+        num_steps: of methods without a model, the environment steps that were trained for, those after the last
+            finished episode included; None of other methods, and in older files.
     """
 
     key: RunKey
@@ -78,6 +80,7 @@ class RunResult:
     revision: str
     versions: Mapping[str, str]
     machine: Mapping[str, Any]
+    num_steps: int | None = None
 
     @property
     def counted(self) -> tuple[Episode, ...]:
@@ -88,12 +91,13 @@ class RunResult:
         """Write the file of this run in ``folder``, whole or not at all.
 
         Raises:
+            ValueError: a number is not finite.
             OSError: it cannot be written.
         """
         content = {"schema": SCHEMA, **asdict(self), "key": self.key._asdict()}
         content["episodes"] = [episode._asdict() for episode in self.episodes]
         path = folder / self.key.file_name
-        replace_text(path, json.dumps(content, indent=1) + "\n")
+        replace_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
         return path
 
     @classmethod

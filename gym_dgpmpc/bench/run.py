@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from gym_dgpmpc.bench.jobs import Folders
@@ -48,6 +47,9 @@ class Run:
             steps, once it is there; until then its episodes count as if none ended early.
         asked: settings in place of the method's own.
         command: that makes this run.
+
+    Raises:
+        ValueError: there is no method of a name that is given.
     """
 
     method: str
@@ -58,6 +60,11 @@ class Run:
     steps_of: str | None = None
     asked: Mapping[str, Any] = field(default_factory=dict)
     command: str = "Run(...).perform(...)"
+
+    def __post_init__(self) -> None:
+        for name in filter(None, (self.method, self.steps_of)):
+            if name not in METHODS:
+                raise ValueError(f"there is no method {name!r}; there are {', '.join(METHODS)}")
 
     @property
     def key(self) -> RunKey:
@@ -107,22 +114,33 @@ class Run:
         if not path.exists():
             return False
         result = RunResult.read(path)
-        settings = json.loads(json.dumps(self.settings))
+        self._refuse_other_settings(result, path)
+        if len(result.counted) >= self.episodes and not METHODS[self.method].is_model_free:
+            return True
+        if result.num_steps is not None:
+            return result.num_steps >= self.steps_wanted(results)
+        last = result.episodes[-1].total_steps if result.episodes else 0
+        # Older files do not say how long was trained, and an episode that was cut off at the end is not told of.
+        return last > self.steps_wanted(results) - self.task.episode_steps
+
+    def _refuse_other_settings(self, result: RunResult, path: Path) -> None:
+        """Compare all settings; one that the file does not name had the method's own value.
+
+        Raises:
+            OtherRunError: some differ; names them.
+        """
+        wanted = _as_in_files(self.settings)
+        made_with = _as_in_files(METHODS[self.method].settings(self.task)) | dict(result.settings)
         differing = [
-            f"{name} was {result.settings[name]}, now {settings[name]}"
-            for name in sorted(set(settings) & set(result.settings))
-            if result.settings[name] != settings[name]
+            f"{name} was {made_with[name]}, now {wanted.get(name, 'there is no such setting')}"
+            for name in sorted(made_with)
+            if name not in wanted or made_with[name] != wanted[name]
         ]
         if differing:
             raise OtherRunError(
                 f"{path} holds a run with other settings ({'; '.join(differing)}): choose another folder for the "
                 "results, or delete that file"
             )
-        if len(result.counted) >= self.episodes and not METHODS[self.method].is_model_free:
-            return True
-        last = result.episodes[-1].total_steps if result.episodes else 0
-        # An episode that was cut off at the end is not told of.
-        return last > self.steps_wanted(results) - self.task.episode_steps
 
     def episodes_so_far(self, work: Path) -> int:
         """Episodes of an unfinished run that it will not have to play again."""
@@ -137,7 +155,6 @@ class Run:
             RunFolderError: the folder for unfinished runs holds this run with other settings.
             RunInUseError: another process is running it.
         """
-        torch.set_num_threads(1)
         method = METHODS[self.method]
         if isinstance(method, PlanningMethod):
             result = self._plan(method, folders)
@@ -195,6 +212,7 @@ class Run:
             key=self.key,
             episodes=tuple(episodes.found),
             settings=settings,
+            num_steps=model.num_timesteps,
             milliseconds_per_action=1e3 * watch.seconds / watch.calls if watch.calls else None,
             started=started.isoformat(timespec="seconds"),
             command=self.command,
@@ -202,6 +220,12 @@ class Run:
             versions=versions(),
             machine=machine(),
         )
+
+
+def _as_in_files(settings: Settings) -> Settings:
+    """Settings as they are read from a file again: tuples are lists."""
+    read: Settings = json.loads(json.dumps(settings))
+    return read
 
 
 def _episode(row: EpisodeRow) -> Episode:

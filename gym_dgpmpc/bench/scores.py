@@ -35,6 +35,8 @@ class Threshold(NamedTuple):
 
     value: float
     origin: str
+    is_scaled: bool = False
+    """Whether it was worked out from the runs themselves, as a share of the way to the ceiling."""
 
 
 def load_runs(folder: Path) -> dict[str, dict[str, list[RunResult]]]:
@@ -66,11 +68,15 @@ def reference_of(study: Mapping[str, Runs], preferred: str | None = None) -> dic
     the most layers and the first name, among those that the task has: a rule that does not look at returns.
 
     Raises:
-        ValueError: no task has the preferred method.
+        ValueError: the preferred method is none of the package's own, or no task has it.
     """
-    if preferred is not None and not any(preferred in methods for methods in study.values()):
-        known = sorted({method for methods in study.values() for method in methods})
-        raise ValueError(f"no run is of the method {preferred!r}; there are {', '.join(known)}")
+    candidates = {task: [method for method in methods if method.startswith(OURS)] for task, methods in study.items()}
+    known = sorted(set().union(*candidates.values()))
+    if preferred is not None and preferred not in known:
+        raise ValueError(
+            f"the reference is a setting of {OURS} that has runs, got {preferred!r}; there are "
+            f"{', '.join(known) or 'none'}"
+        )
 
     def rank(method: str) -> tuple[bool, int, int, int, str]:
         tasks = [methods[method] for methods in study.values() if method in methods]
@@ -78,7 +84,6 @@ def reference_of(study: Mapping[str, Runs], preferred: str | None = None) -> dic
         layers = setting[1] if setting else 0
         return (method != preferred, -len(tasks), -sum(map(len, tasks)), -layers, method)
 
-    candidates = {task: [m for m in methods if m.startswith(OURS) or m == preferred] for task, methods in study.items()}
     return {task: min(methods, key=rank) for task, methods in candidates.items() if methods}
 
 
@@ -184,9 +189,8 @@ def threshold_of(task: str, runs: Runs, given: Mapping[str, float]) -> Threshold
     scale = scale_of(runs)
     if scale is None:
         return None
-    return Threshold(
-        scale[0] + NEAR * (scale[1] - scale[0]), f"{NEAR:.0%} of the way from random actions to the ceiling"
-    )
+    origin = f"{NEAR:.0%} of the way from random actions to the ceiling"
+    return Threshold(scale[0] + NEAR * (scale[1] - scale[0]), origin, is_scaled=True)
 
 
 def _each(

@@ -7,6 +7,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
+from gym_dgpmpc.bench import paper
 from gym_dgpmpc.bench.contact import ContactRun
 from gym_dgpmpc.bench.contact_data import CASES
 from gym_dgpmpc.bench.contact_results import ContactKey, ContactSettings
@@ -16,11 +17,7 @@ from gym_dgpmpc.bench.run import Run
 from gym_dgpmpc.bench.tasks import TASKS
 from gym_dgpmpc.errors import DGPMPCError
 
-PAPER_TASKS = {"ModCartPole-v0": 15, "BiasedReacher-v0": 15, "RiskSensitiveHalfCheetah-v0": 10}
-"""The tasks of the paper, and the episodes that it plays on each after a random one."""
-PAPER_LAYERS = (1, 2, 3)
-PAPER_KERNELS = ("rbf", "matern52", "matern32", "matern12")
-PAPER_SEEDS = tuple(range(10))
+PAPER_SEEDS = tuple(range(paper.TRIALS))
 
 BASELINES = ("PETS TS1", "PETS TSinf", "GP-MM", "GP-DS", "SAC", "TD3", "PPO")
 STOCK_TASKS = {
@@ -143,17 +140,16 @@ class ContactSuite:
         """
         if narrowed.episodes is not None:
             raise SuiteError(f"the contact study has no episodes, asked for are {narrowed.episodes}")
-        cases = {f"case {name}": name for name in CASES}
-        models = {f"DGP L={depth} {kernel}": (kernel, depth) for kernel in PAPER_KERNELS for depth in PAPER_LAYERS}
-        tasks = _chosen("task", cases, narrowed.tasks)
-        methods = _chosen("method", models, narrowed.methods)
-        return [
-            ContactRun(ContactKey(case, *model, seed), self.settings)
+        keys = [
+            ContactKey(case, kernel, layers, seed)
             for seed in (PAPER_SEEDS if narrowed.seeds is None else narrowed.seeds)
-            for task, case in cases.items()
-            for method, model in models.items()
-            if task in tasks and method in methods
+            for case in CASES
+            for kernel in paper.KERNELS
+            for layers in paper.LAYERS
         ]
+        tasks = _chosen("task", [key.task for key in keys], narrowed.tasks)
+        methods = _chosen("method", [key.method for key in keys], narrowed.methods)
+        return [ContactRun(key, self.settings) for key in keys if key.task in tasks and key.method in methods]
 
 
 def _chosen(what: str, names: Iterable[str], asked: Sequence[str] | None) -> set[str]:
@@ -170,7 +166,7 @@ def _chosen(what: str, names: Iterable[str], asked: Sequence[str] | None) -> set
 def _paper(methods: Iterable[str]) -> tuple[Cell, ...]:
     """Methods on the paper's tasks."""
     methods = tuple(methods)
-    return tuple(Cell(method, task, episodes) for task, episodes in PAPER_TASKS.items() for method in methods)
+    return tuple(Cell(method, task, episodes) for task, episodes in paper.EPISODES.items() for method in methods)
 
 
 def _stock() -> tuple[Cell, ...]:
@@ -191,7 +187,7 @@ _OF_RUNS = (
     RunSuite(
         "table",
         "average episode return by kernel and layers on the paper's three tasks",
-        _paper(dgp_mpc(layers, kernel) for kernel in PAPER_KERNELS for layers in PAPER_LAYERS),
+        _paper(dgp_mpc(layers, kernel) for kernel in paper.KERNELS for layers in paper.LAYERS),
     ),
     RunSuite(
         "comparison",
@@ -207,7 +203,7 @@ _OF_RUNS = (
         "unmodified",
         "the cart-pole in the middle of its rail: RBF kernels, and PETS as published",
         (
-            *(Cell(dgp_mpc(layers, "rbf"), "SwingUpCartPole-v0", 15) for layers in PAPER_LAYERS),
+            *(Cell(dgp_mpc(layers, "rbf"), "SwingUpCartPole-v0", 15) for layers in paper.LAYERS),
             Cell("PETS as published", "SwingUpCartPole-v0", 15),
         ),
     ),
@@ -215,7 +211,7 @@ _OF_RUNS = (
         "long-cheetah",
         "the half cheetah beyond small samples",
         tuple(
-            Cell(dgp_mpc(layers, "matern32"), "RiskSensitiveHalfCheetah-v0:50 episodes", 50) for layers in PAPER_LAYERS
+            Cell(dgp_mpc(layers, "matern32"), "RiskSensitiveHalfCheetah-v0:50 episodes", 50) for layers in paper.LAYERS
         ),
     ),
     RunSuite(

@@ -1,5 +1,6 @@
 """The tables of a report, each as lines of Markdown; what the columns mean is told in docs/report.md."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -73,28 +74,42 @@ def improvement_table(runs: Runs, reference: str | None) -> list[str]:
     if reference not in returns:
         return []
     own, rows = returns[reference], []
-    for other in scores.compared(returns, reference)[1:]:
+    for other in compared_at_equal_steps(runs, reference)[1:]:
         value = estimate(probability_of_improvement([own], [returns[other]]))
         p = number(difference_p_value(own, returns[other]))
         rows.append([other, value, f"{len(own)} × {len(returns[other])}", p])
     return table(["Y", f"P({reference} > Y)", "pairs of runs", "p of no difference"], rows) if rows else []
 
 
+def compared_at_equal_steps(runs: Runs, reference: str | None) -> list[str]:
+    """The reference and the methods that it can be compared with at equal steps; none without the reference."""
+    _, returns = at_equal_steps(runs)
+    return scores.compared(returns, reference) if reference in returns else []
+
+
+def compared_on_several_tasks(study: Mapping[str, Runs], references: Mapping[str, str]) -> dict[str, list[str]]:
+    """The same by task, of the methods that more than one task has; tasks without one are left out."""
+    compared = {task: compared_at_equal_steps(runs, references.get(task)) for task, runs in study.items()}
+    tasks_of = Counter(other for methods in compared.values() for other in methods[1:])
+    kept = {
+        task: [*methods[:1], *(other for other in methods[1:] if tasks_of[other] > 1)]
+        for task, methods in compared.items()
+    }
+    return {task: methods for task, methods in kept.items() if len(methods) > 1}
+
+
 def overall_improvement_table(study: Mapping[str, Runs], references: Mapping[str, str]) -> list[str]:
-    """The same, averaged over the tasks that both methods have, where these are more than one."""
+    """The same as `improvement_table`, averaged over the tasks that both methods have, where these are several."""
     pairs: dict[str, list[tuple[ndarray, ndarray]]] = {}
-    for task, runs in study.items():
-        _, returns = at_equal_steps(runs)
-        reference = references.get(task)
-        if reference in returns:
-            for other in scores.compared(returns, reference)[1:]:
-                pairs.setdefault(other, []).append((returns[reference], returns[other]))
+    for task, (reference, *others) in compared_on_several_tasks(study, references).items():
+        _, returns = at_equal_steps(study[task])
+        for other in others:
+            pairs.setdefault(other, []).append((returns[reference], returns[other]))
     rows = []
     for other in scores.compared(pairs, None):
-        if len(pairs[other]) > 1:
-            own_samples, other_samples = zip(*pairs[other], strict=True)
-            value = estimate(probability_of_improvement(own_samples, other_samples))
-            rows.append([other, value, str(len(pairs[other]))])
+        own_samples, other_samples = zip(*pairs[other], strict=True)
+        value = estimate(probability_of_improvement(own_samples, other_samples))
+        rows.append([other, value, str(len(pairs[other]))])
     return table(["Y", f"P({scores.OURS} > Y)", "tasks"], rows) if rows else []
 
 

@@ -18,6 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy import ndarray
 
+from gym_dgpmpc.agents.files import replace_file
+
 MODEL_COLOUR, TRUTH_COLOUR, RANDOM_COLOUR = "tab:blue", "black", "tab:gray"
 BANDS = {0.9: 0.2, 0.5: 0.35}
 """The bands of a fan, widest first: probability inside -> opacity."""
@@ -79,7 +81,7 @@ def plot_learning_curve(
     axes.set_title(title)
     axes.grid(alpha=0.3)
     axes.legend(loc="best")
-    figure.savefig(path, dpi=150)
+    write_figure(figure, path, dpi=150)
 
 
 def plot_prediction_fan(
@@ -130,7 +132,24 @@ def plot_prediction_fan(
     figure.suptitle(title + hidden)
     handles, names = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), fontsize="small")
-    figure.savefig(path, dpi=130)
+    write_figure(figure, path, dpi=130)
+
+
+def write_figure(figure: Figure, path: str | Path, *, dpi: int) -> None:
+    """Write a picture, whole or not at all; the same numbers give the same PNG file.
+
+    Args:
+        figure: what is drawn.
+        path: the file; its suffix decides the format.
+        dpi: dots per inch.
+
+    Raises:
+        OSError: it cannot be written; an old file is untouched.
+    """
+    path = Path(path)
+    kind = path.suffix.removeprefix(".") or "png"
+    metadata = {"Software": None} if kind == "png" else None
+    replace_file(path, lambda file: figure.savefig(file, format=kind, dpi=dpi, metadata=metadata))
 
 
 def observation_labels(env_class: type, size: int) -> list[str]:

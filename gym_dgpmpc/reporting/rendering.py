@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -66,7 +66,10 @@ def write_gif(frames: Sequence[ndarray], path: str | Path, frames_per_second: fl
 
     Raises:
         ValueError: there are no frames.
+        OSError: it cannot be written; an old file is untouched.
     """
+    from gym_dgpmpc.agents.files import replace_file  # which takes seconds to import
+
     if not frames:
         raise ValueError("a GIF needs at least one frame, got none")
     # The format counts in hundredths of a second, and browsers slow down what is faster than two of them.
@@ -74,7 +77,11 @@ def write_gif(frames: Sequence[ndarray], path: str | Path, frames_per_second: fl
     # One palette for the whole episode: a palette for each frame flickers and costs space.
     middle = Image.fromarray(frames[len(frames) // 2]).quantize(128)
     images = [Image.fromarray(frame).quantize(palette=middle, dither=Image.Dither.NONE) for frame in frames]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=False)
+
+    def save(file: IO[bytes]) -> None:
+        images[0].save(file, "GIF", save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=False)
+
+    replace_file(Path(path), save)
 
 
 def _backends() -> list[str | None]:

@@ -32,3 +32,48 @@ def test_settings_are_found_by_id():
     assert presets.settings_for(with_module) is presets.STOCK["FetchReachDense-v4"]
     assert presets.settings_for("ToyPush-v0") == {}
     assert not set(presets.PAPER) & set(presets.STOCK)
+
+
+@pytest.mark.parametrize(
+    ("env_ids", "planning"),
+    [
+        (["ModCartPole-v0", "SwingUpCartPole-v0"], (30, 5, 1)),
+        (["BiasedReacher-v0", "Reacher7DoF-v0"], (20, 5, 1)),
+        (["RiskSensitiveHalfCheetah-v0", "VelocityHalfCheetah-v0"], (40, 10, 2)),
+    ],
+)
+def test_planning_is_as_in_the_papers_table(env_ids, planning):
+    names = ("horizon", "num_iterations", "actions_per_plan")
+    for env_id in env_ids:
+        shared = {"num_candidates": 300, "num_elites": 30, "num_particles": 5}
+        wanted = dict(zip(names, planning, strict=True)) | shared
+        assert presets.PAPER[env_id] == wanted | {"num_inducing": 200}
+        assert presets.COMPARISON_GP[env_id] == presets.PAPER[env_id]
+        assert {name: presets.COMPARISON_PETS[env_id][name] for name in wanted} == wanted
+
+
+@pytest.mark.parametrize(
+    ("env_ids", "networks", "planning"),
+    [
+        (["ModCartPole-v0", "SwingUpCartPole-v0"], (3, 500, (1e-4, 2.5e-4, 2.5e-4, 5e-4), 1e-3), (400, 40, 25)),
+        (
+            ["BiasedReacher-v0", "Reacher7DoF-v0"],
+            (4, 200, (2.5e-4, 5e-4, 5e-4, 5e-4, 7.5e-4), 7.5e-4),
+            (400, 40, 25),
+        ),
+        (
+            ["RiskSensitiveHalfCheetah-v0", "VelocityHalfCheetah-v0"],
+            (4, 200, (2.5e-5, 5e-5, 7.5e-5, 7.5e-5, 1e-4), 1e-3),
+            (500, 50, 30),
+        ),
+    ],
+)
+def test_pets_is_as_published(env_ids, networks, planning):
+    """Chua et al. (2018), from their configuration files."""
+    of_networks = ("num_hidden_layers", "hidden_size", "weight_decay", "learning_rate")
+    of_planning = ("num_candidates", "num_elites", "horizon")
+    for env_id in env_ids:
+        wanted = dict(zip(of_networks, networks, strict=True))
+        assert {name: presets.COMPARISON_PETS[env_id][name] for name in of_networks} == wanted
+        wanted |= dict(zip(of_planning, planning, strict=True))
+        assert presets.PETS[env_id] == wanted | {"num_iterations": 5, "actions_per_plan": 1, "num_particles": 20}

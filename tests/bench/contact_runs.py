@@ -1,7 +1,7 @@
 """Results of the contact study that were made up, for tests of files and reports."""
 
 from gym_dgpmpc.bench.contact_data import CASES
-from gym_dgpmpc.bench.contact_results import PHASES, QUANTITIES, ContactKey, ContactResult, ContactSettings
+from gym_dgpmpc.bench.contact_results import PHASES, QUANTITIES, QUANTITY, ContactKey, ContactResult, ContactSettings
 from gym_dgpmpc.bench.contact_scores import SCORES
 
 TINY = ContactSettings(
@@ -15,9 +15,18 @@ TINY = ContactSettings(
 )
 """A run takes a fraction of a second."""
 
+OFFSETS = {
+    (quantity, score): (QUANTITIES.index(quantity) - QUANTITIES.index(QUANTITY)) * (10.0 + SCORES.index(score))
+    for quantity in QUANTITIES
+    for score in SCORES
+}
+"""By quantity and score, all different but those of `QUANTITY`, which are zero."""
+
 
 def made_up(key: ContactKey, value: float, after: float | None = None, starts_after: int = 1) -> ContactResult:
     """A run that has ``value`` for each score of each step, of 3 starts of which some are in contact from step 10 on.
+
+    That is of `QUANTITY`; each score of the other quantities has `OFFSETS` added.
 
     Args:
         key: of the run.
@@ -31,7 +40,10 @@ def made_up(key: ContactKey, value: float, after: float | None = None, starts_af
     values = {"before": value, "after": value if after is None else after}
     scores = {
         quantity: {
-            phase: {score: [values[phase] if n else None for n in counts[phase]] for score in SCORES}
+            phase: {
+                score: [values[phase] + OFFSETS[quantity, score] if n else None for n in counts[phase]]
+                for score in SCORES
+            }
             for phase in PHASES
         }
         for quantity in QUANTITIES

@@ -62,8 +62,26 @@ def test_what_lies_far_below_is_cut_off_and_said(drawn, tmp_path):
         -60.0
     )  # the usual lowest is -50, half of its distance from the top below
     assert axes.get_ylim()[1] > -30.0
-    assert axes.get_xlabel().endswith("\n(1 curve starts lower, from −1,400)")
+    assert axes.get_xlabel().endswith("\n(1 curve goes lower, to −1,400)")
     np.testing.assert_array_equal(lines_of(axes)["SAC"].get_ydata(), [-1400, -900])  # cut by the axis, not changed
+
+
+def test_a_band_is_the_interval_of_the_mean(drawn, study, tmp_path):
+    charts.plot_tasks({"Pendulum-v1": [OWN, "SAC"]}, study, {}, tmp_path / "a.png", "return")
+    (band,) = drawn[0].axes[0].collections  # one seed has none
+    # Of two runs: from the one to the other, at each of the two steps.
+    assert {(200, 1), (200, 3), (300, 3), (300, 5)} == {(x, y) for x, y in band.get_paths()[0].vertices.tolist()}
+
+
+def test_what_lies_far_below_leaves_room_for_the_ceiling(drawn, tmp_path):
+    study = grouped(
+        run(OWN, [-30.0, -32.0]), run("PETS TS1", [-50.0, -40.0]), run("SAC", [-1400.0, -900.0]),
+        run("true dynamics", [-10.0]),
+    )  # fmt: skip
+    charts.plot_tasks({"Pendulum-v1": [OWN, "PETS TS1", "SAC"]}, study, {}, tmp_path / "a.png", "return")
+    low, high = drawn[0].axes[0].get_ylim()
+    assert low == pytest.approx(-50.0 - 0.5 * 40.0)  # the ceiling is the top that distances are taken from
+    assert high == pytest.approx(-10.0 + 0.06 * 60.0)
 
 
 def test_steps_and_wall_clock(drawn, study, tmp_path):

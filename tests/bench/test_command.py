@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+from typing import get_type_hints
 
 import pytest
 from typer.testing import CliRunner
@@ -98,6 +99,11 @@ def test_an_interrupted_suite_goes_on(bench, monkeypatch):
     result = bench("--seeds", 0)
     assert result.exit_code == 0, result.output
     assert result.stdout.startswith("2 jobs: 0 finished, 2 left")
+
+
+def test_the_help_names_the_suites_that_there_are():
+    suite = get_type_hints(cli.bench.bench, include_extras=True)["suite"]
+    assert re.split(r", | or ", suite.__metadata__[0].help.rstrip(".")) == [*suites.SUITES]
 
 
 def test_jobs_that_are_no_runs(bench, monkeypatch, tmp_path):

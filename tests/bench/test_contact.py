@@ -21,6 +21,7 @@ from gym_dgpmpc.bench.contact_scores import crps
 from gym_dgpmpc.bench.jobs import Folders, Job, carry_out
 from gym_dgpmpc.bench.suites import ContactSuite, Narrowed, SuiteError
 from gym_dgpmpc.cli import app
+from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.envs.mod_cartpole import ModCartPoleEnv
 from tests.bench.contact_runs import TINY, made_up
@@ -56,10 +57,33 @@ def test_a_run_scores_what_it_keeps():
     assert result.training["iterations"] == TINY.first_iterations and result.fit_seconds > 0
 
 
+@pytest.mark.parametrize("key", [ContactKey("a", "matern12", 3, 0), ContactKey("b", "rbf", 2, 1)])
+@pytest.mark.parametrize("patience", [None, 7])
+def test_a_run_trains_the_model_of_its_key_and_settings(monkeypatch, key, patience):
+    class Trained(Exception):
+        """Enough seen."""
+
+    def fit(model, *_):
+        raise Trained(model)
+
+    monkeypatch.setattr(DeepGPDynamics, "fit", fit)
+    settings = replace(TINY, patience=patience)
+    with pytest.raises(Trained) as seen:
+        ContactRun(key, settings).measure()
+    (model,) = seen.value.args
+    assert (model.kernel, model.num_layers) == (key.kernel, key.num_layers)
+    assert model.draw_kind == "marginal"  # the paper's law
+    assert (model.inference.patience, model.dtype) == (patience, torch.float64)
+    for name in ("num_inducing", "first_iterations", "num_samples", "sample_spacing"):
+        assert getattr(model, name) == getattr(settings, name)
+
+
 def test_a_study_is_narrowed_as_every_suite_and_its_seeds_come_outermost():
     jobs = TINY_SUITE.jobs(Narrowed(seeds=[3, 4], tasks=["case [ab]"], methods=["DGP L=[12] rbf"]))
     assert jobs[0].key == ContactKey("a", "rbf", 1, 3) and isinstance(jobs[0], Job)
-    assert jobs[0].name == "contact study, case a | rbf, L=1 | seed 3"
+    assert jobs[0].name == "case a | DGP L=1 rbf | seed 3"
+    task, method, _ = jobs[0].name.split(" | ")
+    assert TINY_SUITE.jobs(Narrowed(seeds=[3], tasks=[task], methods=[method])) == jobs[:1]
     assert [job.key.seed for job in jobs] == [3] * 4 + [4] * 4
     assert len({job.key for job in jobs}) == 8
     assert len({job.key for job in ContactSuite().jobs(Narrowed())}) == 3 * 4 * 3 * 10
@@ -162,7 +186,7 @@ def test_the_command_line_runs_and_reports(made_up_suite):
 def test_a_run_that_fails_does_not_cost_the_others(made_up_suite):
     options = ["--tasks", "case a", "--methods", "DGP L=1 rbf,DGP L=1 matern12", "--seeds", "0"]
     told = CliRunner().invoke(app, ["bench", "contact", *options])
-    assert told.exit_code == 1 and "case a | rbf, L=1 | seed 0: ArithmeticError: no end" in told.output
+    assert told.exit_code == 1 and "case a | DGP L=1 rbf | seed 0: ArithmeticError: no end" in told.output
     left = {path.name for path in made_up_suite.iterdir()}
     assert left == {"contact_a_matern12_L1_seed0.json", "contact_a_rbf_L1_seed0.log"}
     assert "ArithmeticError: no end" in (made_up_suite / "contact_a_rbf_L1_seed0.log").read_text()

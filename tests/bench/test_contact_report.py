@@ -1,5 +1,8 @@
 """The report of the contact study on results that were made up, whose differences are known."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,15 +14,17 @@ from gym_dgpmpc.bench.contact_report import (
     told,
     verdict,
 )
-from gym_dgpmpc.bench.contact_results import ContactKey
+from gym_dgpmpc.bench.contact_results import PHASES, ContactKey
+from gym_dgpmpc.bench.contact_scores import SCORES
 from gym_dgpmpc.bench.statistics import Estimate
-from tests.bench.contact_runs import made_up
+from tests.bench.contact_runs import OFFSETS, made_up
 
 KERNELS = ("matern12", "rbf")
 BETTER = {("rbf", 1): 0.0, ("rbf", 2): -1.0, ("matern12", 1): -3.0, ("matern12", 2): -3.5}
 """What a setting adds to a seed's score."""
 
 SEEDS = range(4)
+OTHERS = ("position", "angle", "velocity", "change of angular velocity")
 
 
 def runs(case="a", missing=()):
@@ -99,9 +104,36 @@ def test_a_report_holds_levels_and_differences(tmp_path):
     assert "| L = 2 less L = 1 | all kernels | 4 | −0.750 [−0.750, −0.750] | better |" in text
     assert "| Matérn-1/2 less RBF | 2 | 4 | −2.500 [−2.500, −2.500] | better |" in text
     assert "| RBF | 1 | 4 | 150.000 [" in text
+    assert (
+        "| kernel | L | position: NLPD | CRPS (m) | inside 90% | angle: NLPD | CRPS (rad) | inside 90% "
+        "| velocity: NLPD | CRPS (m/s) | inside 90% | change of angular velocity: NLPD | CRPS (rad/s) | inside 90% |"
+    ) in text
+    # 150 of the first setting, and the offsets of made-up runs.
+    cells = [150 + OFFSETS[quantity, score] for quantity in OTHERS for score in ("nlpd", "crps", "inside_90")]
+    assert f"| RBF | 1 | {' | '.join(f'{cell:.3f}' for cell in cells)} |" in text
     case_b = text[text.index("## Case b") :]
     assert "steps from the contact on" in text[: text.index("## Case b")] and "steps from the contact on" not in case_b
     assert "seeds 0, 1, 2, 3" in text and "num_inducing 15" in text
+
+
+def test_curves_by_step_are_of_the_seeds_of_a_setting(drawn, tmp_path):
+    """The mean over seeds at each step, and its interval, of steps that differ."""
+    for run in runs():
+        later = replace(run, scores=json.loads(json.dumps(run.scores)))
+        for score in SCORES:
+            by_phase = later.scores["angular velocity"]
+            for phase in PHASES:
+                values = by_phase[phase][score]
+                by_phase[phase][score] = [None if v is None else v + 1000.0 * step for step, v in enumerate(values)]
+        later.write(tmp_path / "runs")
+    report_contact_study(tmp_path / "runs", tmp_path / "out")
+    fans, steps = drawn
+    assert "seed 0" in fans.get_suptitle()
+    rbf = next(line for line in steps.axes[0].lines if line.get_label() == "RBF")
+    np.testing.assert_allclose(rbf.get_ydata(), 150.0 + 1000.0 * np.arange(15))
+    band = steps.axes[0].collections[0].get_paths()[0].vertices
+    first_step = band[band[:, 0] == 1, 1]
+    assert 0.0 <= first_step.min() < 100.0 and 200.0 < first_step.max() <= 300.0
 
 
 def test_a_report_can_be_made_of_what_there_is(tmp_path):

@@ -1,10 +1,12 @@
 """Jobs come back from processes, Ray and Dask; the death of a worker costs none of them."""
 
+from dataclasses import replace
+
 import pytest
 
 from gym_dgpmpc.bench import executors
 from gym_dgpmpc.bench.executors import ClusterError, executor
-from gym_dgpmpc.bench.jobs import Folders, keep
+from gym_dgpmpc.bench.jobs import Folders, carry_out, keep, log_of
 from gym_dgpmpc.bench.results import RunResult
 from gym_dgpmpc.bench.run import Run
 from tests.bench.toy import TINY, TOY, Errand, steps_in, toy
@@ -31,6 +33,32 @@ def test_one_after_the_other_in_this_process(errand, folders):
     assert [outcome.content for _, outcome in found] == ["a", None, "c"]
     assert found[1][1].told == "ValueError: it was not to be"
     assert "perform" in found[1][1].failure
+
+
+@pytest.mark.parametrize("content", [None, "half a file"])
+def test_a_job_whose_file_is_something_elses_fails_here(folders, tmp_path, content):
+    """Whatever the worker's folder has: the file is not replaced by what would come back."""
+    run = Run("PPO", TOY, 0, 1, asked=TINY["PPO"])
+    other = replace(run, asked=TINY["PPO"] | {"gamma": 0.5})
+    run.perform(folders)
+    path = folders.results / run.file_name
+    if content is not None:
+        path.write_text(content)
+    elsewhere = Folders(tmp_path / "there", tmp_path / "there")
+    before = path.read_text()
+
+    def worker(jobs, _):
+        return ((job, carry_out(job, elsewhere)) for job in jobs)
+
+    done = list(executors.refusing(worker)([other, replace(run, seed=1)], folders))
+    for job, outcome in done:
+        keep(job, outcome, folders.results)
+    assert [job.seed for job, _ in done] == [0, 1]
+    assert path.read_text() == before
+    refused, allowed = (outcome for _, outcome in done)
+    assert refused.told.startswith("OtherRunError: " if content is None else "ResultError: ")
+    assert refused.content is None and log_of(other, folders.results).exists()
+    assert allowed.content is not None
 
 
 def test_processes_that_die(errand, folders, tmp_path, monkeypatch):
@@ -81,5 +109,5 @@ def test_addresses_of_no_cluster(cluster):
 
 def test_what_is_not_installed_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
-    with pytest.raises(ClusterError, match=r"pip install 'gym-dgpmpc\[dask\]'"):
+    with pytest.raises(ClusterError, match="distributed is not installed: it comes with this package's extra 'dask'"):
         executor(1, "dask")

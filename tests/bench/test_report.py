@@ -76,6 +76,62 @@ def test_every_table_and_figure_says_what_it_was_made_from(folder, tmp_path):
     assert "Seeds 0, 1 (of true dynamics: 0)." in body[alone:]
 
 
+@pytest.fixture(scope="module")
+def caption_of(tmp_path_factory):
+    """What stands under a table or figure that is found by a text, of runs whose seeds tell their methods and tasks."""
+    tmp_path = tmp_path_factory.mktemp("captions")
+    seeds = {OWN: 1, "DGP-MPC L=3 rbf": 2, "DGP-MPC L=5 rbf": 3, "SAC": 4, "TD3": 5, "true dynamics": 6}
+    tasks = {
+        "ModCartPole-v0": [*seeds], "BiasedReacher-v0": [OWN, "SAC", "true dynamics"], "Pendulum-v1": [OWN, "TD3"],
+        "RiskSensitiveHalfCheetah-v0": ["SAC"], "Fetch-v4": [OWN, "SAC", "true dynamics"],
+    }  # fmt: skip
+    for number, (task, methods) in enumerate(tasks.items()):
+        for method in methods:
+            # The slowest has no episode by the time that the others end.
+            steps = 1000 if (method, task) == ("TD3", "ModCartPole-v0") else 100
+            value = 9.0 if method == "true dynamics" else float(seeds[method])
+            run(method, [value, value], task=task, seed=10 * number + seeds[method], steps=steps,
+                random=-1.0 if method == OWN else None,
+                success=[True, True] if method == "SAC" else None).write(tmp_path / "runs")  # fmt: skip
+    page = write_report(tmp_path / "runs", tmp_path / "out", reference=OWN)[0].read_text()
+
+    def find(text, after="# Results"):
+        found = page.index(text, page.index(f"{after}\n"))
+        return re.search(r"Seeds (.*)\. Made with", page[found:])[1]
+
+    return find
+
+
+CART_POLE = "## ModCartPole-v0"
+
+
+@pytest.mark.parametrize(
+    ("text", "after", "seeds"),
+    [
+        # The ceiling is drawn; other settings, and tasks with one method alone, are not.
+        ("comparison.png", "# Results", {1, 4, 5, 6, 11, 14, 16, 21, 25, 41, 44, 46}),
+        ("maximum.png", "# Results", {1, 4, 5, 6, 11, 14, 16, 21, 25, 41, 44, 46}),
+        ("variability.png", "# Results", {1, 4, 5, 6, 11, 14, 16, 21, 25, 41, 44, 46}),
+        # Only the reference and what it is compared with on several tasks; no TD3, which is compared on one alone.
+        ("P(DGP-MPC > Y)", "# Results", {1, 4, 11, 14, 41, 44}),
+        # All that decides the scale of its tasks, and nothing of the others.
+        ("seeds by task", "# Results", {1, 2, 3, 4, 5, 6, 11, 14, 16, 41, 44, 46}),
+        ("the paper, L = 1", "# Results", {1, 2, 11}),  # which has no five layers
+        ("_learning.png", CART_POLE, {1, 4, 5, 6}),
+        ("_settings.png", CART_POLE, {1, 2, 3, 6}),
+        ("sd over seeds", CART_POLE, {1, 2, 3, 4, 6}),
+        (f"P({OWN} > Y)", CART_POLE, {1, 4}),
+        ("mean of the last", CART_POLE, {1, 2, 3, 4, 5, 6}),
+        ("Kaplan", CART_POLE, {1, 2, 3, 4, 5}),
+        ("Kaplan", "## Fetch-v4", {41, 44, 46}),  # whose threshold the ceiling decides
+        ("all episodes | last", CART_POLE, {4}),
+        ("minutes a run", CART_POLE, {1, 2, 3, 4, 5, 6}),
+    ],
+)
+def test_a_caption_tells_of_the_runs_that_are_shown_or_are_the_scale_and_of_no_others(caption_of, text, after, seeds):
+    assert {int(number) for number in re.findall(r"(?<![=\w-])\d+(?!\w)", caption_of(text, after))} == seeds
+
+
 def test_differing_versions_are_named():
     study = grouped(
         run("A", [1.0], versions={"numpy": "2.0", "torch": "2.3"}), run("B", [1.0], versions={"numpy": "2.1"}),
@@ -143,8 +199,8 @@ def test_tasks_and_references_can_be_chosen(folder, tmp_path):
         ResultError, match="has no runs of Ant-v5; there are runs of ModCartPole-v0, Alone-v0, Fetch-v4"
     ):
         write_report(folder, tmp_path / "out", tasks=["Ant-v5"])
-    with pytest.raises(ValueError, match="no run is of the method 'PETS'"):
-        write_report(folder, tmp_path / "out", reference="PETS")
+    with pytest.raises(ValueError, match="a setting of DGP-MPC that has runs, got 'SAC'"):
+        write_report(folder, tmp_path / "out", reference="SAC")
     with pytest.raises(ValueError, match="a threshold is given for Ant-v5"):
         write_report(folder, tmp_path / "out", thresholds={"Ant-v5": 1.0})
 
@@ -198,4 +254,6 @@ def test_command_without_results(command, tmp_path):
 def test_command_with_a_method_that_was_not_run(command, folder, tmp_path):
     result = command(folder, "--out", tmp_path / "out", "--reference", "PETS")
     assert result.exit_code == 2
-    assert result.stderr.startswith("error: no run is of the method 'PETS'; there are DGP-MPC")
+    assert result.stderr.startswith(
+        "error: the reference is a setting of DGP-MPC that has runs, got 'PETS'; there are DGP-MPC"
+    )

@@ -1,6 +1,7 @@
 """Result files: what is written is what is read, and what is none is refused by name."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -23,6 +24,20 @@ def result(seed: int = 0, method: str = "DGP-MPC L=2 matern32", task: str = "Pen
 
 def test_what_is_written_is_read_again(tmp_path):
     assert RunResult.read(result().write(tmp_path / "runs")) == result()
+
+
+def test_what_is_not_finite_is_not_written(tmp_path):
+    with pytest.raises(ValueError, match="JSON"):
+        replace(result(), milliseconds_per_action=float("nan")).write(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_that_do_not_say_how_long_was_trained_are_read(tmp_path):
+    path = result().write(tmp_path)
+    content = json.loads(path.read_text())
+    del content["num_steps"]
+    path.write_text(json.dumps(content))
+    assert RunResult.read(path) == result()
 
 
 def test_random_episodes_do_not_count():

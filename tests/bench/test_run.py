@@ -5,6 +5,7 @@ import os
 from dataclasses import replace
 
 import pytest
+import torch
 
 from gym_dgpmpc.bench.jobs import Folders, carry_out, keep, log_of, unfinished
 from gym_dgpmpc.bench.methods import METHODS
@@ -46,6 +47,7 @@ def test_every_method_leaves_its_result(method, folders):
     assert [episode.actions for episode in result.episodes] == ["random"] * is_random + [acting] * (count - is_random)
     assert all(episode.seconds >= 0 for episode in result.episodes)
     assert result.milliseconds_per_action > 0
+    assert result.num_steps == (EPISODE_STEPS * count if METHODS[method].is_model_free else None)
     assert result.settings == json.loads(json.dumps(run.settings))
     assert set(TINY[method]) <= set(result.settings)
     assert {"python", "torch", "stable-baselines3", "gym-dgpmpc"} <= set(result.versions)
@@ -119,6 +121,18 @@ def test_without_a_model_the_steps_count(folders):
     assert replace(run, times=2).max_steps == 2 * 2 * EPISODE_STEPS
 
 
+def test_a_shorter_run_is_not_finished_however_many_steps_its_last_episode_lacks(folders):
+    run = tiny("SAC", toy(terminate_at=7), episodes=1)
+    run.perform(folders)
+    result = RunResult.read(folders.results / run.file_name)
+    assert (result.num_steps, result.episodes[-1].total_steps) == (2 * EPISODE_STEPS, 21)
+    assert run.is_finished(folders.results)
+    a_little_longer = replace(run, task=replace(run.task, episode_steps=EPISODE_STEPS + 1))
+    assert not a_little_longer.is_finished(folders.results)
+    replace(result, num_steps=None).write(folders.results)  # as in older files: up to an episode may be missing
+    assert a_little_longer.is_finished(folders.results)
+
+
 def test_the_steps_of_another_run_count_once_it_is_there(folders):
     """Ten times the steps of a run whose episodes ended early are ten times fewer."""
     planned = tiny(DGP, toy(terminate_at=4), episodes=1)
@@ -168,6 +182,21 @@ def test_other_settings_are_no_finished_run(folders):
     assert "choose another folder for unfinished runs" in told
 
 
+def test_settings_that_a_file_does_not_name_are_the_methods_own(folders):
+    """Files of runs that were made by hand name fewer."""
+    run = Run(DGP, TOY, 0, 1)
+    tiny(DGP, episodes=1).perform(folders)
+    one = RunResult.read(folders.results / run.file_name)
+    replace(one, settings={"num_inducing": run.settings["num_inducing"]}).write(folders.results)
+    assert run.is_finished(folders.results)
+    with pytest.raises(OtherRunError, match=r"other settings \(gibbs_every was \d+, now 0\)"):
+        replace(run, asked={"gibbs_every": 0}).is_finished(folders.results)
+    assert replace(run, asked={"gibbs_every": run.settings["gibbs_every"]}).is_finished(folders.results)
+    replace(one, settings={"temperature": 2}).write(folders.results)
+    with pytest.raises(OtherRunError, match="temperature was 2, now there is no such setting"):
+        run.is_finished(folders.results)
+
+
 def test_a_damaged_result_is_told_of(folders):
     run = tiny("PPO", episodes=1)
     folders.results.mkdir()
@@ -180,6 +209,29 @@ def test_a_damaged_result_is_told_of(folders):
 def test_settings_that_do_not_exist_are_named():
     with pytest.raises(ValueError, match=r"SAC has no settings \['horizon'\]; it has"):
         METHODS["SAC"].settings(TOY, horizon=3)
+
+
+def test_what_the_task_tells_the_environment_is_no_setting_to_ask_for():
+    with pytest.raises(ValueError, match=r"SAC has no settings \['penalise_step'\]; it has"):
+        METHODS["SAC"].settings(TASKS["RiskSensitiveHalfCheetah-v0"], penalise_step=False)
+
+
+@pytest.mark.parametrize("names", [("PETS", None), ("SAC", "PETS")])
+def test_methods_that_do_not_exist_are_named(names):
+    with pytest.raises(ValueError, match=r"there is no method 'PETS'; there are DGP-MPC L=1 .*, PETS TS1, .*SAC"):
+        Run(names[0], TOY, 0, 1, steps_of=names[1])
+
+
+def test_every_job_is_done_on_one_thread(folders, monkeypatch):
+    job, seen = tiny("PPO"), []
+    monkeypatch.setattr(Run, "perform", lambda *_: seen.append(torch.get_num_threads()))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        carry_out(job, folders)
+    finally:
+        torch.set_num_threads(threads)
+    assert seen == [1]
 
 
 def test_a_failure_leaves_no_result_but_a_log(folders, tmp_path):
@@ -220,8 +272,9 @@ def test_a_result_of_another_machine_is_kept(folders, tmp_path):
     assert run.is_finished(folders.results)
 
 
-def test_model_free_methods_learn_of_the_risk_that_planners_plan_with():
-    task = TASKS["RiskSensitiveHalfCheetah-v0"]
+@pytest.mark.parametrize("name", [name for name in TASKS if name.startswith("RiskSensitiveHalfCheetah")])
+def test_model_free_methods_learn_of_the_risk_that_planners_plan_with(name):
+    task = TASKS[name]
     for is_model_free in (True, False):
         env = task.make(model_free=is_model_free)
         assert env.get_wrapper_attr("plans_with_another_reward") != is_model_free

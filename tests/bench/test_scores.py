@@ -68,8 +68,11 @@ def test_reference_is_chosen_by_its_runs_and_not_by_its_returns():
     # one has the most tasks, although two has as many runs; where it is, it stands.
     assert scores.reference_of(study) == {"a": one, "b": one, "c": one}
     assert scores.reference_of(study, two) == {"a": two, "b": two, "c": one}
-    with pytest.raises(ValueError, match=r"no run is of the method 'DGP'; there are DGP-MPC L=1 rbf, .*, SAC"):
-        scores.reference_of(study, "DGP")
+    for name in ("DGP", "SAC", "DGP-MPC L=4 rbf"):
+        with pytest.raises(ValueError, match=rf"got '{name}'; there are {one}, {two}, {three}$"):
+            scores.reference_of(study, name)
+    with pytest.raises(ValueError, match=r"there are none$"):
+        scores.reference_of({"d": study["d"]}, "SAC")
     # As many tasks and runs: the deeper one.
     assert scores.reference_of({"c": study["c"]}) == {"c": three}
 
@@ -122,11 +125,13 @@ def test_scale_goes_from_random_actions_to_the_ceiling():
 def test_threshold_comes_from_the_first_source_that_has_one():
     plain = {"A": [run("A", [1.0])]}
     scaled = {"A": [run("A", [1.0], random=0.0)], "true dynamics": [run("true dynamics", [100.0])]}
-    assert scores.threshold_of("ModCartPole-v0", plain, {"ModCartPole-v0": 3.0}) == (3.0, "as given")
+    assert scores.threshold_of("ModCartPole-v0", plain, {"ModCartPole-v0": 3.0}) == (3.0, "as given", False)
     assert scores.threshold_of("ModCartPole-v0", plain, {}).value == 149.81
     assert scores.threshold_of("BiasedReacher-v0", plain, {}).value == -39.89
     assert scores.threshold_of("InvertedPendulum-v5", scaled, {}).value == 950.0
     assert scores.threshold_of("Pendulum-v1", scaled, {}).value == pytest.approx(90.0)
+    assert scores.threshold_of("Pendulum-v1", scaled, {}).is_scaled
+    assert not scores.threshold_of("InvertedPendulum-v5", scaled, {}).is_scaled
     assert scores.threshold_of("Pendulum-v1:learned reward", scaled, {}).value == pytest.approx(90.0)
     assert scores.threshold_of("Pendulum-v1", plain, {}) is None
 

@@ -9,7 +9,8 @@ import pytest
 
 from gym_dgpmpc.agents.presets import COMPARISON_PETS, PAPER, PETS
 from gym_dgpmpc.bench.methods import METHODS
-from gym_dgpmpc.bench.suites import PAPER_TASKS, SUITES, Narrowed, SuiteError, find_suite
+from gym_dgpmpc.bench.paper import EPISODES as PAPER_TASKS
+from gym_dgpmpc.bench.suites import SUITES, Narrowed, SuiteError, find_suite
 from gym_dgpmpc.bench.tasks import TASKS
 from gym_dgpmpc.gp.kernels import KERNELS
 

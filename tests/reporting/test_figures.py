@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 import gym_dgpmpc  # noqa: F401  # registers the environments
@@ -28,6 +29,28 @@ def test_learning_curve(drawn, tmp_path):
     assert "550 environment steps" in axes.get_xlabel()
     assert axes.get_title() == "a title"
     assert Image.open(tmp_path / "a.png").size[0] > 500
+
+
+def test_a_picture_that_cannot_be_drawn_leaves_the_old_one(tmp_path, monkeypatch):
+    def full_disk(figure, file, **kwargs):
+        file.write(b"half a picture")
+        raise OSError(28, "no space left on device")
+
+    path = tmp_path / "a.png"
+    plot_learning_curve([-3.0, 40.0], path, title="a title")
+    before = path.read_bytes()
+    monkeypatch.setattr(Figure, "savefig", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        plot_learning_curve([-3.0, 90.0], path, title="a title")
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_suffix_decides_the_format(tmp_path):
+    plot_learning_curve([-3.0, 40.0], tmp_path / "a.pdf", title="a title")
+    plot_learning_curve([-3.0, 40.0], tmp_path / "a.svg", title="a title")
+    assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF")
+    assert b"<svg" in (tmp_path / "a.svg").read_bytes()
 
 
 def test_learning_curve_of_nothing(tmp_path):

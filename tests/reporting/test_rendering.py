@@ -28,6 +28,21 @@ def test_gif(tmp_path):
     np.testing.assert_array_equal(read, frames(4))
 
 
+def test_a_gif_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch):
+    def full_disk(image, file, *args, **kwargs):
+        file.write(b"half a picture")
+        raise OSError(28, "no space left on device")
+
+    path = tmp_path / "a.gif"
+    write_gif(frames(4), path, frames_per_second=25.0)
+    before = path.read_bytes()
+    monkeypatch.setattr(Image.Image, "save", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        write_gif(frames(2), path, frames_per_second=25.0)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_gif_is_no_faster_than_browsers_play(tmp_path):
     write_gif(frames(2), tmp_path / "a.gif", frames_per_second=500.0)
     with Image.open(tmp_path / "a.gif") as gif:
