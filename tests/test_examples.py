@@ -1,14 +1,17 @@
 """The examples run, at a tiny size."""
 
 import math
+import re
 from pathlib import Path
 
+import gymnasium
 import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from examples import own_task, quickstart
 
+ROOT = Path(own_task.__file__).parents[1]
 TINY = {
     "num_inducing": 10,
     "num_features": 8,
@@ -41,10 +44,18 @@ def test_own_task():
     assert (low >= 0).all() and (high <= 1).all() and (high > low).all()
 
 
+def test_the_readmes_other_agents_can_be_made_as_it_says():
+    namespace = {"env": gymnasium.make("gym_dgpmpc:ModCartPole-v0")}
+    learning, *others = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert "agent.learn(" in learning  # for minutes; `test_quickstart` does the same in less
+    for code in others:
+        exec(code, namespace)
+    assert {namespace[name].num_timesteps for name in ("pets", "gp", "ceiling")} == {0}
+
+
 def test_the_tutorial_shows_the_example():
-    root = Path(own_task.__file__).parents[1]
     code = Path(own_task.__file__).read_text(encoding="utf-8")
-    assert f"```python\n{code}```\n" in (root / "docs" / "own_task.md").read_text(encoding="utf-8")
+    assert f"```python\n{code}```\n" in (ROOT / "docs" / "own_task.md").read_text(encoding="utf-8")
     assert len(code.splitlines()) < 40
 
 
