@@ -111,4 +111,11 @@ def keep(job: Job, outcome: Outcome, results: Path) -> None:
 
 def unfinished(jobs: Sequence[Job], results: Path) -> list[Job]:
     """Those that are left to do, in their order; one whose file is something else's is among them, to fail."""
-    return [job for job in jobs if refusal(job, results) is not None or not job.is_finished(results)]
+
+    def is_left(job: Job) -> bool:
+        try:
+            return not job.is_finished(results)
+        except DGPMPCError:
+            return True
+
+    return [job for job in jobs if is_left(job)]

@@ -5,6 +5,7 @@ size. If the likelihood of held-out data no longer improves, it stops. `dynamics
 """
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -128,13 +129,13 @@ def sample_pool(
     """
     factors = factorise_all(kernel, model)
     for _ in range(MAX_ROLLBACKS + 1):
-        try:
-            states = list(mcem.sample(kernel, model, chain, data, num_samples, spacing, generator, settings, factors))
-            pool = torch.stack([state.position for state in states])
-        except FactorisationError:  # of an exact draw: the steps before it led to what is not finite
-            pool = None
-        if pool is not None and is_plausible(pool):
-            return Sampled(pool, states[-1], settings.step_size)
+        # Of the states in between only the positions are kept: a state is several times as large.
+        positions, last = [], chain
+        with suppress(FactorisationError):  # of an exact draw: the steps before it led to what is not finite
+            for last in mcem.sample(kernel, model, chain, data, num_samples, spacing, generator, settings, factors):
+                positions.append(last.position)
+        if len(positions) == num_samples and is_plausible(pool := torch.stack(positions)):
+            return Sampled(pool, last, settings.step_size)
         settings = replace(settings, step_size=0.5 * settings.step_size)
     raise TrainingError(
         f"sampling the posterior diverged {MAX_ROLLBACKS + 1} times, the last time with the step size "
