@@ -118,5 +118,5 @@ class EpisodeRecord:
         self.plan_steps = [int(step) for step in state["plan_steps"].tolist()]
         self.plan_seconds = state["plan_seconds"].tolist()
         self.num_late = int(state["num_late"])
-        self.has_terminated = bool(state.get("has_terminated", False))  # files of version 0.1.0 do not say
+        self.has_terminated = bool(state.get("has_terminated", False))  # older files do not say
         self.started = time.perf_counter() - float(state["seconds"])

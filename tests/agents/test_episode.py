@@ -6,13 +6,13 @@ from gym_dgpmpc.agents.episode import EpisodeRecord
 from gym_dgpmpc.types import PlanInfo
 
 
-def record_of(rewards, plans, horizon=2):
-    """A record of these rewards, with plans {step: expected return}."""
+def record_of(rewards, plans, horizon=2, terminated=False):
+    """A record of these rewards, with plans {step: expected return}; the last step may be a termination."""
     record = EpisodeRecord(3, horizon)
     for step, reward in enumerate(rewards):
         if step in plans:
             record.add_plan(PlanInfo(plans[step], step, 4), 0.001 * (step + 1))
-        record.add_reward(reward)
+        record.add_reward(reward, terminated=terminated and step == len(rewards) - 1)
     return record
 
 
@@ -26,10 +26,9 @@ def test_steps_beyond_the_end_are_left_out_of_what_was_obtained():
 
 
 def test_steps_that_a_plan_has_beyond_a_termination_earn_nothing():
-    record = record_of([1.0, 1.0, 1.0], {0: 2.0, 2: 1.0})
-    assert record.predicted_and_obtained() == (0.75, 1.0)
-    record.add_reward(0.0, terminated=True)
-    record.rewards.pop()
+    plans = {0: 2.0, 2: 1.0}
+    assert record_of([1.0, 1.0, 1.0], plans).predicted_and_obtained() == (0.75, 1.0)
+    record = record_of([1.0, 1.0, 1.0], plans, terminated=True)
     assert record.predicted_and_obtained() == (0.75, 0.75)
     loaded = EpisodeRecord(3, 2)
     loaded.load_state_dict(record.state_dict())

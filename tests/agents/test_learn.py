@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from gym_dgpmpc import MPCAgent
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError, PlanningError
+from gym_dgpmpc.planning.cem import CEM
 from tests.agents.point_mass import LENGTH, KnownPointMass, LinearModel, actions_of, agent, planner
 
 
@@ -275,3 +277,11 @@ def test_a_planner_of_a_shorter_horizon_than_its_use_is_refused():
     with pytest.raises(ValueError, match="actions_per_plan must lie in 1 to the planner's horizon 5, got 6"):
         agent(actions_per_plan=6)
     assert planner().horizon == 5
+
+
+def test_what_a_planner_of_double_precision_decides_is_stored_as_it_was_performed():
+    bound, env = torch.tensor([2.0], dtype=torch.float64), KnownPointMass()
+    cem = CEM(action_low=-bound, action_high=bound, horizon=5, num_candidates=40, num_elites=5, num_iterations=3)
+    learner = MPCAgent(env, LinearModel(), cem, seed=0).learn(LENGTH + 5)
+    assert learner.dynamics.fits == [LENGTH]
+    np.testing.assert_array_equal(actions_of(env), learner.store.transitions().action.numpy())
