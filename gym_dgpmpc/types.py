@@ -58,9 +58,14 @@ class ObservationSpec:
     body_frame: tuple[tuple[int, int, int], ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("angles", "absolute", "not_inputs", "constant"):
-            object.__setattr__(self, name, tuple(map(index, getattr(self, name))))
-        object.__setattr__(self, "body_frame", tuple(tuple(map(index, triple)) for triple in self.body_frame))
+        for name in ("angles", "absolute", "not_inputs", "constant", "body_frame"):
+            given = getattr(self, name)
+            try:
+                kept = tuple(tuple(map(index, each)) if name == "body_frame" else index(each) for each in given)
+            except TypeError as error:
+                wanted = "triples of indices such as ((2, 0, 1),)" if name == "body_frame" else "indices such as (0, 2)"
+                raise TypeError(f"{name} must be {wanted}, got {given!r}") from error
+            object.__setattr__(self, name, kept)
 
 
 @runtime_checkable

@@ -67,7 +67,7 @@ class CEM:
             on a range of 0.1; a fraction does not depend on the units.)
 
     Raises:
-        ValueError: naming the argument, what was expected and what was received.
+        TypeError, ValueError: naming the argument, what was expected and what was received.
     """
 
     def __init__(
@@ -199,7 +199,12 @@ class CEM:
 
 
 def _check_bounds(low: Tensor, high: Tensor) -> None:
-    """Raise ValueError unless the bounds are two finite floating-point vectors in order."""
+    """Raise TypeError or ValueError unless the bounds are two finite floating-point vectors in order."""
+    if not (isinstance(low, Tensor) and isinstance(high, Tensor)):
+        raise TypeError(
+            f"action_low and action_high must be tensors (torch.as_tensor), got {type(low).__name__} and "
+            f"{type(high).__name__}"
+        )
     if low.ndim != 1 or low.shape != high.shape or low.shape[0] == 0:
         raise ValueError(
             f"action_low and action_high must be vectors of one length, got {tuple(low.shape)} and {tuple(high.shape)}"

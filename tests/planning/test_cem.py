@@ -232,3 +232,8 @@ class TestAgainstLQR:
 def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         CEM(**{**bounds([-1.0], [1.0]), "horizon": 3, **arguments})
+
+
+def test_bounds_that_are_no_tensors(unchecked):
+    with pytest.raises(TypeError, match=r"must be tensors \(torch.as_tensor\), got ndarray and ndarray"):
+        CEM(action_low=-np.ones(2), action_high=np.ones(2), horizon=3)
