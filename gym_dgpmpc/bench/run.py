@@ -23,7 +23,7 @@ from gym_dgpmpc.bench.tasks import Task
 from gym_dgpmpc.errors import DGPMPCError, RunInUseError
 from gym_dgpmpc.reporting.circumstances import machine, revision, versions
 from gym_dgpmpc.reporting.recording import EpisodeRecorder
-from gym_dgpmpc.reporting.run import EPISODES_FILE, EpisodeRow, RunFolder, TrainingRun, read_rows
+from gym_dgpmpc.reporting.run import EPISODES_FILE, EpisodeRow, RunFolder, TrainingRun, read_rows, step_limit
 
 LOCK_SECONDS = 10.0
 """How long to wait for a run's folder: of a process that was killed the system may still be holding it."""
@@ -180,8 +180,7 @@ class Run:
                 env,
                 partial(method.make, settings=settings, seed=self.seed),
                 num_episodes=self.episodes,
-                # Planning may begin in the middle of an episode, which then is none of those that are asked for.
-                total_timesteps=self.max_steps + (self.task.episode_steps if settings.get("learning_starts") else 0),
+                total_timesteps=step_limit(self.episodes, self.task.episode_steps, settings.get("learning_starts")),
                 results_only=True,
             )
             if not run.is_complete:

@@ -173,7 +173,7 @@ def _set_up_run(
 ) -> "TrainingRun":
     """The run that the options describe, with what they leave open filled in."""
     from gym_dgpmpc.agents import DGPMPCAgent
-    from gym_dgpmpc.reporting.run import RunFolder, TrainingRun
+    from gym_dgpmpc.reporting.run import RunFolder, TrainingRun, step_limit
 
     assert env.spec is not None
     env_id, max_steps = env.spec.id, env.spec.max_episode_steps
@@ -182,9 +182,7 @@ def _set_up_run(
         if max_steps is None:
             raise ValueError(f"episodes of {env_id} have no time limit and may never end: give --timesteps")
         episodes = episodes or DEFAULT_EPISODES
-        starts = arguments["learning_starts"]
-        # Planning may begin in the middle of an episode, which then is none of those that are asked for.
-        timesteps = (max_steps if starts is None else starts + max_steps) + episodes * max_steps
+        timesteps = step_limit(episodes, max_steps, arguments["learning_starts"])
     folder = RunFolder(
         out or Path("runs") / f"{env_id}-seed{arguments['seed']}",
         {"environment": env_id, **arguments},

@@ -168,6 +168,19 @@ class RunFolder:
             )
 
 
+def step_limit(num_episodes: int, episode_steps: int, learning_starts: int | None) -> int:
+    """Environment steps within which so many episodes are planned from their first step on, after random actions.
+
+    Args:
+        num_episodes: how many.
+        episode_steps: the most that one has.
+        learning_starts: random actions; None: one episode of them.
+    """
+    # Planning may begin in the middle of an episode, which then is none of those that are asked for.
+    at_random = episode_steps if learning_starts is None else learning_starts + episode_steps
+    return at_random + num_episodes * episode_steps
+
+
 class TrainingRun:
     """One agent in one environment, recorded in a folder; goes on where the folder's newest checkpoint was written.
 
