@@ -44,8 +44,9 @@ def test_td3_explores_with_the_noise_of_its_authors():
     draws = np.array([model.action_noise() for _ in range(2000)])
     env.close()
     assert draws.shape == (2000, 7)
-    np.testing.assert_allclose(draws.mean(axis=0), 0.0, atol=0.015)
-    np.testing.assert_allclose(draws.std(axis=0), 0.1, rtol=0.08)
+    # Five standard errors of a mean and of a deviation.
+    np.testing.assert_allclose(draws.mean(axis=0), 0.0, atol=5 * 0.1 / np.sqrt(len(draws)))
+    np.testing.assert_allclose(draws.std(axis=0), 0.1, rtol=5 / np.sqrt(2 * len(draws)))
 
 
 @pytest.mark.parametrize("task", PAPER)
