@@ -19,7 +19,7 @@ class EpisodeRecord:
 
     def __init__(self, number: int, horizon: int):
         self.number, self.horizon = number, horizon
-        self.started = time.perf_counter()
+        self._started = time.perf_counter()
         self.rewards: list[float] = []
         self.plans: list[PlanInfo] = []
         self.plan_steps: list[int] = []
@@ -44,6 +44,11 @@ class EpisodeRecord:
     def episode_return(self) -> float:
         return float(np.sum(self.rewards))
 
+    @property
+    def seconds(self) -> float:
+        """Wall-clock time since the episode began, training included; not the time in which the run was interrupted."""
+        return time.perf_counter() - self._started
+
     def predicted_and_obtained(self) -> tuple[float, float]:
         """Reward per step: what the plans expected over their horizons, and what was obtained over the same steps.
 
@@ -63,7 +68,7 @@ class EpisodeRecord:
     def metrics(self) -> dict[str, float]:
         """Names and values for the logger; those of planning only if there were plans."""
         metrics: dict[str, float] = {"rollout/ep_return": self.episode_return, "rollout/ep_length": len(self.rewards)}
-        metrics["time/ep_seconds"] = time.perf_counter() - self.started
+        metrics["time/ep_seconds"] = self.seconds
         if self.plans:
             predicted, obtained = self.predicted_and_obtained()
             metrics["planner/expected_return"] = self.horizon * predicted
@@ -78,9 +83,8 @@ class EpisodeRecord:
 
     def line(self, num_timesteps: int) -> str:
         """The episode on one line, for a person."""
-        seconds = time.perf_counter() - self.started
         text = f"episode {self.number:3d} | {num_timesteps:6d} steps | return {self.episode_return:9.2f}"
-        text += f" | {seconds:6.1f} s"
+        text += f" | {self.seconds:6.1f} s"
         if not self.plans:
             return f"{text} | random actions"
         predicted, obtained = self.predicted_and_obtained()
@@ -100,7 +104,7 @@ class EpisodeRecord:
             "plan_seconds": torch.tensor(self.plan_seconds, dtype=torch.float64),
             "num_late": torch.tensor(self.num_late),
             "has_terminated": torch.tensor(self.has_terminated),
-            "seconds": torch.tensor(time.perf_counter() - self.started, dtype=torch.float64),
+            "seconds": torch.tensor(self.seconds, dtype=torch.float64),
         }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -119,4 +123,4 @@ class EpisodeRecord:
         self.plan_seconds = state["plan_seconds"].tolist()
         self.num_late = int(state["num_late"])
         self.has_terminated = bool(state.get("has_terminated", False))  # older files do not say
-        self.started = time.perf_counter() - float(state["seconds"])
+        self._started = time.perf_counter() - float(state["seconds"])

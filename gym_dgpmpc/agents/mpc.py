@@ -139,7 +139,9 @@ class MPCAgent(ActingAgent):
             progress_bar: show one.
             run_folder: where to keep checkpoints, for this process alone.
             resume: go on from the checkpoint in ``run_folder``; without one the run begins.
-            checkpoint_every: environment steps between checkpoints within an episode, beside those at its end.
+            checkpoint_every: environment steps between checkpoints within an episode, beside those at its end: what a
+                power cut may cost. One that cannot be repeated (of a plant, or beside others) keeps the steps, and a
+                run that goes on from there begins a new episode.
 
         Raises:
             EnvironmentDataError: the environment returned something that is not finite.

@@ -10,7 +10,6 @@ from typing import Any
 
 from stable_baselines3.common.utils import get_latest_run_id
 
-from gym_dgpmpc.agents.env_state import can_replay, episode_start
 from gym_dgpmpc.agents.event_files import drop_events_after
 from gym_dgpmpc.agents.resuming import resume_agent
 from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
@@ -33,7 +32,7 @@ class Safeguard:
         run_folder: the folder, or the checkpoints of one that is held already.
         resume: go on from the folder's checkpoint, if there is one.
         checkpoint_every: environment steps between two checkpoints within an episode, beside those after each; None
-            for the latter alone.
+            for the latter alone. See `after_step` for episodes that cannot be repeated.
 
     Raises:
         RunInUseError, CheckpointWriteError: see `RunCheckpoints`.
@@ -129,7 +128,8 @@ class Safeguard:
     def after_step(self, *, episode_ended: bool) -> None:
         """Write a checkpoint if one is due, and stop if that was asked for.
 
-        Of an episode that cannot be repeated a stop keeps the steps; a new episode begins when the run goes on.
+        A checkpoint within an episode that cannot be repeated, as in a plant, keeps the steps; a new episode begins
+        when the run goes on.
 
         Raises:
             KeyboardInterrupt, SystemExit: see `StopRequests`.
@@ -138,21 +138,10 @@ class Safeguard:
         stopping = self.stop.received is not None
         # A step of n environments is n timesteps, so it may pass over the multiple.
         every = self.every is not None and self.agent.num_timesteps % self.every < self.agent.n_envs
-        if episode_ended or stopping or (every and self._can_go_on_within_an_episode()):
+        if episode_ended or stopping or every:
             self._save()
         if stopping:
             self.stop.stop()
-
-    def _can_go_on_within_an_episode(self) -> bool:
-        start = episode_start(self.agent.env)
-        if (start is not None and can_replay(start)) or self.agent.n_envs > 1:  # then episodes begin anew all the same
-            return True
-        self.agent._warn_once(
-            "checkpoint_every is without effect, because this environment cannot be brought back into the middle "
-            "of an episode: checkpoints are written when episodes end. A simulator that repeats an episode when "
-            "it is given the same actions may say so with an attribute can_replay = True"
-        )
-        return False
 
     def _save(self, *, gives_up: bool = False) -> None:
         self.checkpoints.save(collect(self.agent, gives_up=gives_up))

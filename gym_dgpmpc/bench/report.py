@@ -28,7 +28,7 @@ class _Page:
     def __init__(self, folder: Path, origins: Origins) -> None:
         self.lines: list[str] = []
         self.figures: list[Path] = []
-        self._folder, self._origins = folder, origins
+        self._folder, self.origins = folder, origins
 
     def add(self, *lines: str) -> None:
         self.lines += [*lines, ""]
@@ -37,7 +37,7 @@ class _Page:
         """A table with what it shows and where its runs come from; nothing if it is empty."""
         if table:
             self.add(*table)
-            self.add(f"{caption} {self._origins.caption(study)}")
+            self.add(f"{caption} {self.origins.caption(study)}")
 
     def place(self, name: str) -> Path:
         """Where the next figure is to be written."""
@@ -48,7 +48,7 @@ class _Page:
     def show(self, what: str, study: Mapping[str, Runs], caption: str) -> None:
         """Refer to the figure that was written last."""
         self.add(f"![{what}]({self._folder.name}/{self.figures[-1].name})")
-        self.add(f"{caption} {self._origins.caption(study)}")
+        self.add(f"{caption} {self.origins.caption(study)}")
 
 
 def write_report(
@@ -92,7 +92,7 @@ def write_report(
     _add_overview(page, study, references)
     for task, of_task in study.items():
         _add_task(page, task, of_task, references.get(task), thresholds or {})
-    page.add(*Origins(study).lines())
+    page.add(*page.origins.lines())
     replace_text(page_file, "\n".join(page.lines).rstrip() + "\n")
     return [page_file, *page.figures]
 

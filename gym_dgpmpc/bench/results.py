@@ -32,7 +32,7 @@ class Episode(NamedTuple):
     total_steps: int
     """Environment steps of the run up to the episode's end, the random ones included."""
     seconds: float
-    """Wall-clock time since the last episode's end, training included."""
+    """Wall-clock time that it took, training included."""
     success: bool | None = None
     """Whether the goal was reached in the last step, of tasks that say so in ``info["is_success"]``."""
 

@@ -1,7 +1,7 @@
 """One run of a method on a task with a seed: it leaves one result file, and goes on where it was killed.
 
-Agents that plan go on after their last finished episode, from the checkpoint in the run's own folder. Methods without a
-model take seconds to minutes and begin anew.
+Agents that plan go on from the newest checkpoint in the run's own folder. Methods without a model take seconds to
+minutes and begin anew.
 """
 
 import json
@@ -24,6 +24,9 @@ from gym_dgpmpc.errors import DGPMPCError, RunInUseError
 from gym_dgpmpc.reporting.circumstances import machine, revision, versions
 from gym_dgpmpc.reporting.recording import EpisodeRecorder
 from gym_dgpmpc.reporting.run import EPISODES_FILE, EpisodeRow, RunFolder, TrainingRun, read_rows, step_limit
+
+CHECKPOINT_EVERY = 250
+"""Steps between checkpoints within an episode: the paper's half-cheetah has 1000 an episode, which may take hours."""
 
 LOCK_SECONDS = 10.0
 """How long to wait for a run's folder: of a process that was killed the system may still be holding it."""
@@ -181,6 +184,7 @@ class Run:
                 partial(method.make, settings=settings, seed=self.seed),
                 num_episodes=self.episodes,
                 total_timesteps=step_limit(self.episodes, self.task.episode_steps, settings.get("learning_starts")),
+                checkpoint_every=CHECKPOINT_EVERY,
                 results_only=True,
             )
             if not run.is_complete:

@@ -9,7 +9,6 @@ import csv
 import io
 import json
 import shutil
-import time
 from collections.abc import Callable
 from datetime import datetime, timezone
 from pathlib import Path
@@ -48,7 +47,7 @@ class EpisodeRow(NamedTuple):
     total_steps: int
     """Environment steps of the run up to the episode's end."""
     seconds: float
-    """Wall-clock time since the last episode's end, training included."""
+    """Wall-clock time that it took, with the training before it."""
     planning_seconds: float = 0.0
     """The part of it in which plans were made."""
     success: bool | None = None
@@ -302,7 +301,6 @@ class _KeepEpisodes(BaseCallback):
     def __init__(self, run: TrainingRun):
         super().__init__()
         self.run = run
-        self._since = time.perf_counter()
 
     def _on_step(self) -> bool:
         if not self.locals["dones"][0]:
@@ -318,12 +316,11 @@ class _KeepEpisodes(BaseCallback):
             episode_return=float(episode.rewards.sum()),
             steps=len(episode.rewards),
             total_steps=agent.num_timesteps,
-            seconds=round(time.perf_counter() - self._since, 3),
+            seconds=round(record.seconds, 3),
             planning_seconds=round(sum(record.plan_seconds), 3),
             success=None if success is None else bool(success),
         )
         folder.write_rows([*rows, row])
-        self._since = time.perf_counter()
         is_last = sum(row.actions == "planned" for row in [*rows, row]) == self.run.num_episodes
         if (is_last or agent.num_timesteps >= self.run.total_timesteps) and not self.run.results_only:
             self.run.figures = self.run.write_figures(self.run.title)

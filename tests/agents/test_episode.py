@@ -2,6 +2,7 @@
 
 import pytest
 
+from gym_dgpmpc.agents import episode
 from gym_dgpmpc.agents.episode import EpisodeRecord
 from gym_dgpmpc.types import PlanInfo
 
@@ -45,6 +46,19 @@ def test_metrics():
     assert metrics["time/plan_ms"] == pytest.approx(2.0)
     assert metrics["time/plan_ms_p95"] == pytest.approx(2.9)
     assert not any(name.startswith("planner/") for name in record_of([1.0], {}).metrics())
+
+
+def test_the_time_of_an_episode_goes_on_without_that_between(monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(episode.time, "perf_counter", lambda: clock[0])
+    record = EpisodeRecord(3, 2)
+    clock[0] = 130.0
+    state = record.state_dict()
+    clock[0] = 1000.0
+    loaded = EpisodeRecord(3, 2)
+    loaded.load_state_dict(state)
+    clock[0] = 1005.0
+    assert loaded.seconds == loaded.metrics()["time/ep_seconds"] == 35.0
 
 
 def test_the_line_tells_of_candidates_that_diverged():

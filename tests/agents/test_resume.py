@@ -52,6 +52,11 @@ class Plant(NoisyPointMass):
     """One that must not be driven by a recording."""
 
     can_replay = False
+    performed = 0
+
+    def step(self, action):
+        self.performed += 1
+        return super().step(action)
 
 
 class KillAt(BaseCallback):
@@ -121,11 +126,21 @@ def test_logs_that_wait_for_the_next_writing_are_kept(tmp_path):
 
 def test_a_plant_goes_on_from_the_last_finished_episode(tmp_path):
     train(tmp_path / "whole", Plant())
-    with pytest.warns(UserWarning, match=r"checkpoint_every is without effect.*can_replay"):
-        train(tmp_path / "parts", Plant(), kill_at=27, every=1)
+    train(tmp_path / "parts", Plant(), kill_at=27)
     learner = train(tmp_path / "parts", Plant())
     assert learner.num_timesteps == TOTAL
     assert_same(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_checkpoints_within_an_episode_keep_the_steps_of_a_plant(tmp_path):
+    killed = train(tmp_path, Plant(), kill_at=27, every=4)
+    plant = Plant()
+    learner = train(tmp_path, plant, every=4)
+    assert learner.num_timesteps == len(learner.store) == TOTAL
+    assert torch.equal(learner.store.transitions().observation[:24], killed.store.transitions().observation[:24])
+    lengths = torch.bincount(learner.store.episodes).tolist()
+    assert lengths == [LENGTH, LENGTH, 24 - 2 * LENGTH, LENGTH, LENGTH, TOTAL - 24 - 2 * LENGTH]
+    assert plant.performed == TOTAL - 24  # nothing was performed a second time
 
 
 def test_without_a_seed_the_run_keeps_the_one_it_drew(tmp_path):

@@ -7,6 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from gym_dgpmpc.agents import MPCAgent
+from gym_dgpmpc.agents.episode import EpisodeRecord
+from gym_dgpmpc.bench import run as run_module
 from gym_dgpmpc.bench.jobs import Folders, carry_out, keep, log_of, unfinished
 from gym_dgpmpc.bench.methods import METHODS
 from gym_dgpmpc.bench.results import ResultError, RunResult
@@ -80,6 +83,24 @@ def test_a_run_goes_on_after_its_last_finished_episode(method, folders, tmp_path
     undisturbed.perform(folders._replace(results=tmp_path / "undisturbed", work=tmp_path / "elsewhere"))
     expected = RunResult.read(tmp_path / "undisturbed" / run.file_name)
     assert returns(RunResult.read(folders.results / run.file_name)) == returns(expected)
+
+
+def test_a_run_goes_on_within_a_long_episode(folders, tmp_path, monkeypatch):
+    """From its 28th step, the fourth of its third episode: what was done before is repeated without plans."""
+    monkeypatch.setattr(run_module, "CHECKPOINT_EVERY", 7)
+    monkeypatch.setattr(EpisodeRecord, "seconds", property(lambda record: 7.0))  # which goes on, as the record does
+    diary = tmp_path / "diary"
+    run = tiny(DGP, toy(diary=str(diary), ends_at=30, end="interrupt"), episodes=3)
+    with pytest.raises(KeyboardInterrupt):
+        run.perform(folders)
+    plan, planned = MPCAgent._plan, []
+    monkeypatch.setattr(MPCAgent, "_plan", lambda *arguments: planned.append(1) or plan(*arguments))
+    run.perform(folders)
+    assert len(planned) == 4 * EPISODE_STEPS - 28
+    result = RunResult.read(folders.results / run.file_name)
+    run.perform(undisturbed := Folders(tmp_path / "undisturbed", tmp_path / "elsewhere"))
+    assert returns(result) == returns(RunResult.read(undisturbed.results / run.file_name))
+    assert [episode.seconds for episode in result.episodes] == [7.0] * 4
 
 
 def test_planning_with_the_simulator_goes_on_too(folders):

@@ -38,6 +38,8 @@ class Diary(ToyPush):
         penalise: return -100 instead of the reward, which is in the info all the same.
     """
 
+    can_replay = True
+
     def __init__(self, diary=None, ends_at=None, end="kill", penalise=False, terminate_at=None):
         super().__init__(terminate_at=terminate_at)
         self.diary, self.ends_at, self.end, self.penalise = diary, ends_at, end, penalise
