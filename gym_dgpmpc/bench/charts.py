@@ -28,6 +28,9 @@ PANEL = (3.3, 2.6)
 RATIO_FOR_LOG = 3.0
 """If the longest method's runs are so many times longer than the shortest's, the horizontal axis is logarithmic."""
 
+DECADES_ALONE = 3000.0
+"""From so large a ratio of its ends on, a logarithmic axis has numbers at powers of ten alone: more would overlap."""
+
 AXIS = {"steps": "environment steps", "minutes": "wall-clock time (minutes)"}
 EARNED = {"return": "return of an episode", "best": "maximum seen return"}
 DEPTH_COLOURS = ("#E69F00", "#009E73", "#0072B2", "#CC79A7", "#D55E00", "#56B4E9", "#7F7F7F", "#8B4513")
@@ -160,7 +163,9 @@ def _draw_curves(
         ends = [whole.at[-1] for whole in drawn.values()]
         if max(ends) > RATIO_FOR_LOG * min(ends):
             axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+            start = min(whole.at[0] for whole in drawn.values())
+            few = max(ends) < DECADES_ALONE * start
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if few else (1.0,)))
             axes.xaxis.set_major_formatter(EngFormatter(sep="") if clock == "steps" else StrMethodFormatter("{x:g}"))
             axes.xaxis.set_minor_formatter(NullFormatter())
         else:

@@ -93,6 +93,14 @@ def test_steps_and_wall_clock(drawn, study, tmp_path):
     assert "planner with the true dynamics" in lines_of(minutes)
 
 
+@pytest.mark.parametrize(("seconds", "between"), [(600.0, True), (60_000.0, False)])
+def test_numbers_of_a_wide_axis_do_not_overlap(drawn, tmp_path, seconds, between):
+    study = grouped(run(OWN, [1.0, 2.0], seconds=seconds), run("SAC", [0.0, 0.0], seconds=6.0))
+    charts.plot_clocks([OWN, "SAC"], "Pendulum-v1", study["Pendulum-v1"], OWN, tmp_path / "a.png")
+    decades = np.log10(drawn[0].axes[1].xaxis.get_majorticklocs())
+    assert np.allclose(decades, decades.round()) != between
+
+
 def test_one_panel_per_kernel(drawn, tmp_path):
     study = grouped(
         run("DGP-MPC L=1 rbf", [1.0, 2.0]), run("DGP-MPC L=1 rbf", [3.0, 4.0], seed=1),
