@@ -164,8 +164,8 @@ def _draw_curves(
         if max(ends) > RATIO_FOR_LOG * min(ends):
             axes.set_xscale("log")
             start = min(whole.at[0] for whole in drawn.values())
-            few = max(ends) < DECADES_ALONE * start
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if few else (1.0,)))
+            is_wide = max(ends) >= DECADES_ALONE * start
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if is_wide else (1.0, 3.0)))
             axes.xaxis.set_major_formatter(EngFormatter(sep="") if clock == "steps" else StrMethodFormatter("{x:g}"))
             axes.xaxis.set_minor_formatter(NullFormatter())
         else:
