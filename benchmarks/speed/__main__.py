@@ -21,7 +21,7 @@ from benchmarks.speed.measure import WORKERS
 from benchmarks.speed.report import document
 from gym_dgpmpc.agents.files import replace_text
 from gym_dgpmpc.dynamics import compiled_rollout
-from gym_dgpmpc.reporting.circumstances import processor, versions
+from gym_dgpmpc.reporting.circumstances import processor, revision, versions
 
 
 def work(arguments: argparse.Namespace) -> None:
@@ -75,6 +75,7 @@ def main() -> None:
         "load_average_1_min_before": load,
         "load_average_1_min_after": os.getloadavg()[0],
         "compiled": compiled_rollout.is_available(),
+        "revision": revision(),
         "versions": versions(),
     }
     replace_text(arguments.results / "speed.json", json.dumps(facts | {"rows": rows}, indent=1) + "\n")

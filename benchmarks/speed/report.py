@@ -74,8 +74,10 @@ def document(facts: Row, rows: list[Row]) -> str:
     repeats = sorted({row["repeats"] for row in rows if row["repeats"] > 1})
     text = [
         f"Made by `{facts['command']}`; medians of at least {min(repeats, default=1)} repeats after a warm-up, "
-        "K = 300, P = 5, M = 200, F = 128, Matern-3/2; one process at a time. Versions, processor and load in"
-        " `speed.json`.",
+        "K = 300, P = 5, M = 200, F = 128, Matern-3/2; one process at a time. "
+        f"{facts['processor']}, {facts['cores']} cores, load {facts['load_average_1_min_before']:.1f} before and "
+        f"{facts['load_average_1_min_after']:.1f} after; PyTorch {facts['versions']['torch']}, "
+        f"revision {facts['revision']}. More versions in `speed.json`.",
         "",
         "How many times longer the others take, by medians (the last column: this package's plan in units of the bare "
         "products, square roots, exponentials and cosines in PyTorch):",

@@ -58,7 +58,9 @@ def test_rows_of_the_workers_reach_the_files(monkeypatch, tmp_path):
         return SimpleNamespace(stdout="a warning\n" + json.dumps(row("plans", "plan", 12.0, how="joint")) + "\n")
 
     monkeypatch.setattr(subprocess, "run", worker)
-    monkeypatch.setattr(speed.compiled_rollout, "is_available", lambda: True)  # asks the compiler, by `run` too
+    # Both ask other programs, by `run` too.
+    monkeypatch.setattr(speed.compiled_rollout, "is_available", lambda: True)
+    monkeypatch.setattr(speed, "revision", lambda: "abc")
     narrowed = ["--cases", "cart-pole", "--layers", "3", "--threads", "1", "--repeats", "7"]
     options = ["--parts", "plans", *narrowed, "--results", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", ["x", *options])
@@ -66,7 +68,7 @@ def test_rows_of_the_workers_reach_the_files(monkeypatch, tmp_path):
     assert started == [["--worker", "plans", *narrowed]]
     facts = json.loads((tmp_path / "speed.json").read_text())
     assert facts["rows"] == [row("plans", "plan", 12.0, how="joint")]
-    assert facts["processor"] == processor()
+    assert (facts["processor"], facts["revision"]) == (processor(), "abc")
     assert facts["command"] == f"python -m benchmarks.speed {' '.join(options)}"
     assert (tmp_path / "speed.md").read_text() == document(facts, facts["rows"])
 
@@ -77,7 +79,12 @@ def test_the_page_compares_medians():
         row("plans", "plan", 4.0, how="pathwise, step"),
         row("pets", "plan", 40.0, how="PETS, float32"),
     ]
-    page = document({"command": "x"}, rows).splitlines()
+    facts = {
+        "command": "x", "processor": "A Fast One", "cores": 2, "load_average_1_min_before": 0.04,
+        "load_average_1_min_after": 1.26, "revision": "abc", "versions": {"torch": "2.13.0"},
+    }  # fmt: skip
+    page = document(facts, rows).splitlines()
+    assert "A Fast One, 2 cores, load 0.0 before and 1.3 after; PyTorch 2.13.0, revision abc." in page[0]
     assert "| cart-pole | 3 | step | 1 | 3.0 | 10.0 | – | – | – | – |" in page
     assert "| cart-pole | 1 | plan | 3 | joint | 12 | 24 |" in page
     assert "## Plans by PETS" in page and "## Training" not in page
