@@ -55,7 +55,10 @@ SPEC = ObservationSpec(absolute=(1,), not_inputs=(2,), constant=(3,))
 
 
 def trained(draw="AMM", **settings):
-    """A model of four numbers: a change, an absolute value, one that is not fed, and one that never changes."""
+    """A model of four numbers: a change, an absolute value, one that is not fed, and one that never changes.
+
+    The transitions are noisy: without noise the weights are large and of both signs, and their sums mere rounding.
+    """
     generator = seeded(3)
     before, action = normal(generator, 80, 4), normal(generator, 80, 1)
     before[:, 3] = 0.3
@@ -63,6 +66,7 @@ def trained(draw="AMM", **settings):
     after[:, 0] += torch.sin(before[:, 1]) + 0.5 * action[:, 0]
     after[:, 1] = torch.cos(before[:, 0]) * 0.8
     after[:, 2] += 0.2 * before[:, 0] * before[:, 1]
+    after[:, :3] += 0.05 * normal(generator, 80, 3)
     model = SparseGPDynamics(4, 1, SPEC, num_inducing=25, max_iterations=60, draw=draw, **settings)
     model.fit(Transitions(before.float(), action.float(), after.float()), seeded())
     return model
@@ -93,7 +97,11 @@ def test_a_step_has_the_moments_of_many_draws(add_noise):
 
 
 def test_the_particles_carry_the_gaussian_from_step_to_step():
-    """After three steps they have exactly the moments that three steps of the recursion give."""
+    """After three steps they have the moments that three steps of the recursion give, up to rounding.
+
+    Second moments are sums of the weights' products, so each step rounds them by eps (sum |weights|)^2 at most. Both
+    chains do so, and moments of order one carry it on as it is.
+    """
     model = trained()
     sampler = model.draw(7, 3, seeded(4))
     start, actions = torch.tensor([0.2, -0.4, 0.1, 0.3]), normal(seeded(5), 3, 2, 1)
@@ -102,10 +110,12 @@ def test_the_particles_carry_the_gaussian_from_step_to_step():
     for step, action in enumerate(actions):
         mean, covariance = sampler.propagate(mean, covariance, action)
         states = sampler(states, action, step)
-    torch.testing.assert_close(states.mean(0), mean, rtol=0, atol=1e-10)
+    sums = sampler._predictor.weights.abs().sum(0) * sampler._targets.std
+    rounding = 3 * torch.finfo(torch.float64).eps * float(sums.max()) ** 2
+    assert rounding < 1e-4 * float(covariance[:, :3, :3].diagonal(dim1=-2, dim2=-1).min())  # else nothing is tested
+    torch.testing.assert_close(states.mean(0), mean, rtol=0, atol=rounding)
     deviation = (states - states.mean(0)).transpose(0, 1)
-    torch.testing.assert_close(deviation.mT @ deviation / 7, covariance, rtol=0, atol=1e-9)
-    assert float(covariance[:, :3, :3].diagonal(dim1=-2, dim2=-1).min()) > 0
+    torch.testing.assert_close(deviation.mT @ deviation / 7, covariance, rtol=0, atol=rounding)
 
 
 @pytest.mark.parametrize(("num_particles", "size"), [(5, 4), (19, 18), (20, 3)])
