@@ -129,15 +129,20 @@ def test_a_snapshot_is_everything_that_a_step_moves():
 
 @pytest.mark.parametrize("step_size", [3.0, 10.0])
 def test_a_run_that_diverges_goes_back_and_takes_smaller_steps(step_size):
-    """Steps of 10 without exact draws explode at once; what comes out is a usable model all the same."""
+    """Steps of 10 without exact draws explode at once; what comes out is a usable model all the same.
+
+    How far such a chain has got after 200 steps is chance, and another processor's rounding throws the dice anew; only
+    what the criterion of divergence leaves is certain.
+    """
     data = waves(60, 0)
     settings = InferenceSettings(step_size=step_size, look_every=20, gibbs_every=0)
+    start = mcem.MCEM("matern32", *started(data), data, settings).evaluate(seeded())
     trained = train("matern32", *started(data), data, 200, seeded(), settings)
     assert 1 <= trained.num_rollbacks <= training.MAX_ROLLBACKS
     assert trained.settings.step_size == step_size / 2**trained.num_rollbacks
     assert trained.settings.learning_rate == settings.learning_rate / 2**trained.num_rollbacks
     assert trained.num_iterations == 200
-    assert trained.negative_log_joint < 50.0
+    assert trained.negative_log_joint < start + training.EXPLODED
     assert all(p.isfinite().all() for p in trained.model.parameters())
     assert training.is_plausible(trained.chain.position)
 
