@@ -50,7 +50,7 @@ lint: $(INSTALLED)
 
 # MuJoCo draws off-screen through EGL or OSMesa, whichever works here; with neither, the tests of rendering skip.
 test: lint
-	@gl=$${MUJOCO_GL:-$$($(BIN)/python -m gym_dgpmpc.reporting.rendering)}; \
+	@gl=$${MUJOCO_GL:-$$($(BIN)/python -m gym_dgpmpc.runs.rendering)}; \
 	echo "MUJOCO_GL=$$gl"; \
 	MUJOCO_GL=$$gl $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
 

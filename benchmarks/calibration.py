@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.rows import Row, measure_missing
-from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.types import DynamicsModel, Transitions
 

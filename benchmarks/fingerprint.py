@@ -67,9 +67,14 @@ def cases() -> Iterator[tuple[str, Callable[..., Any], Callable[[], Any], dict[s
     for draw in ("TS1", "TSinf", "DS", "MM", "expectation"):
         yield f"PETS {draw}", PETSAgent, make, {**PETS, "draw": draw}
     yield "PETS in bfloat16", PETSAgent, make, {**PETS, "half_precision": True}
-    for own in ({"draw": "DS"}, {"draw": "MM", "add_noise": True}, {"draw": "AMM", "num_particles": 8},
-                {"exact": True, "update_within_episode": True, "kernel": "matern52"}):  # fmt: skip
-        yield f"GP {own}", GPMPCAgent, make, {**GP, **own}
+    gps: list[dict[str, Any]] = [
+        {"draw": "DS"},
+        {"draw": "MM", "add_noise": True},
+        {"draw": "AMM", "num_particles": 8},
+        {"exact": True, "update_within_episode": True, "kernel": "matern52"},
+    ]
+    for settings in gps:
+        yield f"GP {settings}", GPMPCAgent, make, {**GP, **settings}
     yield "true dynamics", true_dynamics, make, {}
 
 
@@ -90,13 +95,14 @@ def fingerprint(agent_of: Callable[..., Any], env_of: Callable[[], Any], setting
             agent.learn(steps * num_envs, run_folder=folder, resume=True)
     data = agent.store.transitions()
     agent.save(keep)
-    actions, state = [], None
+    actions: list[Any] = []
+    state: Any = None
     for observation in data.observation[:3]:
         row = np.tile(observation.numpy()[: agent.observation_space.shape[0]], (num_envs, 1))
         action, state = agent.predict(row, state=state, deterministic=True)
         actions.append(action)
     returns = [info["r"] for info in agent.ep_info_buffer]
-    return f"{digest(*data, agent.store.rewards, agent.store.episodes)} {digest(*actions, *state)} {returns}"
+    return f"{digest(*data, agent.store.rewards, agent.store.episodes)} {digest(*actions, *(state or ()))} {returns}"
 
 
 def main() -> None:
@@ -105,7 +111,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="cases whose names hold this text")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    lines = {}
+    lines: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if arguments.out is None else arguments.out.parent
         for name, agent_of, env_of, settings in cases():

@@ -19,10 +19,10 @@ import torch
 
 from benchmarks.rows import Row, command
 from gym_dgpmpc import DGPMPCAgent
-from gym_dgpmpc.agents.files import replace_text
 from gym_dgpmpc.agents.presets import REAL_TIME
 from gym_dgpmpc.bench import markdown
-from gym_dgpmpc.reporting.circumstances import machine, versions
+from gym_dgpmpc.checkpoints.files import replace_text
+from gym_dgpmpc.runs.provenance import machine, versions
 
 
 def control(agent: DGPMPCAgent, env: gymnasium.Env, seeds: range) -> dict[str, Any]:

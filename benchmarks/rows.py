@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 
-from gym_dgpmpc.agents.files import replace_text
 from gym_dgpmpc.bench import markdown
+from gym_dgpmpc.checkpoints.files import replace_text
 
 Row = dict[str, Any]
 

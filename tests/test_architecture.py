@@ -12,15 +12,17 @@ MODULES = {
 }
 
 LAYERS = (
-    {"types", "errors", "checks"},
+    {"types", "errors", "checks", "randomness"},
     {"envs", "wrappers"},
     {"data"},
     {"gp"},
     {"inference"},
     {"dynamics"},
+    {"tasks"},
     {"planning"},
+    {"checkpoints"},
     {"agents"},
-    {"reporting"},
+    {"runs"},
     {"bench"},
     {"__init__"},
     {"options", "cli"},

@@ -17,15 +17,15 @@ from typer.testing import CliRunner
 
 from gym_dgpmpc import cli, options
 from gym_dgpmpc.agents import DGPMPCAgent
-from gym_dgpmpc.agents.checkpoint import read_checkpoint
 from gym_dgpmpc.agents.presets import PAPER, STOCK
-from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
-from gym_dgpmpc.dynamics.deep_gp_draws import DRAWS, REFRESHES
+from gym_dgpmpc.checkpoints.folder import RunCheckpoints
+from gym_dgpmpc.checkpoints.format import read_checkpoint
+from gym_dgpmpc.dynamics.deep_gp.draws import DRAWS, REFRESHES
 from gym_dgpmpc.gp.kernels import KERNELS
-from gym_dgpmpc.reporting import rendering
+from gym_dgpmpc.runs import rendering
 from tests.agents.point_mass import LENGTH
-from tests.agents.test_goals import Goal
-from tests.reporting.toy import ENV_ID, ToyPush
+from tests.runs.toy import ENV_ID, ToyPush
+from tests.tasks.test_goals import Goal
 
 SMALLEST = ["--layers=1", "--inducing=4", "--features=4", "--particles=2", "--horizon=3", "--candidates=6"]
 SMALLEST += ["--iterations=1", "--first-training=2", "--training=2", "--samples=2", "--spacing=1", "--resample=0"]
@@ -249,7 +249,7 @@ def test_a_task_with_a_goal(run):
 
 def test_a_task_in_a_module_that_lies_in_the_folder(run, tmp_path, monkeypatch):
     (tmp_path / "mine_of_the_tests.py").write_text(
-        "import gymnasium\nfrom tests.reporting.toy import ToyPush\n\n\nclass Mine(ToyPush):\n    pass\n\n\n"
+        "import gymnasium\nfrom tests.runs.toy import ToyPush\n\n\nclass Mine(ToyPush):\n    pass\n\n\n"
         'gymnasium.register("Mine-v0", Mine, max_episode_steps=12)\n'
     )
     monkeypatch.setattr(sys, "path", [*sys.path])

@@ -19,9 +19,9 @@ from benchmarks.rows import command
 from benchmarks.speed.cases import CASES
 from benchmarks.speed.measure import WORKERS
 from benchmarks.speed.report import document
-from gym_dgpmpc.agents.files import replace_text
-from gym_dgpmpc.dynamics import compiled_rollout
-from gym_dgpmpc.reporting.circumstances import processor, revision, versions
+from gym_dgpmpc.checkpoints.files import replace_text
+from gym_dgpmpc.dynamics.deep_gp import compiled_rollout
+from gym_dgpmpc.runs.provenance import processor, revision, versions
 
 
 def work(arguments: argparse.Namespace) -> None:

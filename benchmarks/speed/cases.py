@@ -13,7 +13,7 @@ from torch import Tensor
 
 import gym_dgpmpc  # noqa: F401  # registers the environments
 from gym_dgpmpc.agents.presets import PAPER
-from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.planning.cem import CEM
 from gym_dgpmpc.planning.rollout import rollout_objective
 from gym_dgpmpc.types import DynamicsModel, ObservationSpec, Transitions

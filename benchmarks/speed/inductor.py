@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.speed.cases import NUM_CANDIDATES, NUM_PARTICLES, Case, random_actions, seeded
-from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
-from gym_dgpmpc.dynamics.deep_gp_draws import PathwiseSampler
+from gym_dgpmpc.dynamics.deep_gp.draws import PathwiseSampler
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.types import Transitions
 
 

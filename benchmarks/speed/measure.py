@@ -29,7 +29,7 @@ from benchmarks.speed.cases import (
 )
 from benchmarks.speed.inductor import compiled_step
 from gym_dgpmpc.data.normaliser import Normaliser
-from gym_dgpmpc.dynamics.deep_gp_start import initial_model
+from gym_dgpmpc.dynamics.deep_gp.start import initial_model
 from gym_dgpmpc.inference import mcem, sghmc
 from gym_dgpmpc.inference.mcem import MCEM, Data
 from gym_dgpmpc.planning.rollout import particle_returns, rollout

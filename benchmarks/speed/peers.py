@@ -7,7 +7,7 @@ import torch
 
 from benchmarks.speed.cases import BATCH_SIZE, NUM_CANDIDATES, NUM_INDUCING, NUM_PARTICLES, Case, plan_call
 from gym_dgpmpc.data.encoding import Encoder
-from gym_dgpmpc.dynamics.ensemble import EnsembleDynamics
+from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
 from gym_dgpmpc.types import Transitions
 
 

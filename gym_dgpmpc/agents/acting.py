@@ -11,13 +11,13 @@ import numpy as np
 from stable_baselines3.common.type_aliases import GymEnv
 
 from gym_dgpmpc.agents.base import PlanningAgent
-from gym_dgpmpc.agents.dict_observations import flatten
-from gym_dgpmpc.agents.env_state import episode_start
 from gym_dgpmpc.agents.episode import EpisodeRecord
-from gym_dgpmpc.agents.logged import Logged, read_logged
 from gym_dgpmpc.agents.running import RunningEpisode, next_episode
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
+from gym_dgpmpc.tasks.dict_observations import flatten
+from gym_dgpmpc.tasks.logged import Logged, read_logged
+from gym_dgpmpc.tasks.replay import episode_start
 
 
 class ActingAgent(PlanningAgent):

@@ -12,17 +12,17 @@ import torch
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_system_info, safe_mean
 
-from gym_dgpmpc.agents.checkpoint import CheckpointPath, write_checkpoint
 from gym_dgpmpc.agents.composition import ComposedAgent
-from gym_dgpmpc.agents.dict_observations import check_parts, flatten, layout
-from gym_dgpmpc.agents.loading import load_agent
-from gym_dgpmpc.agents.plan_state import PlanState, PolicyState, pack, unpack
-from gym_dgpmpc.agents.randomness import observation_generator
-from gym_dgpmpc.agents.saving import collect
-from gym_dgpmpc.agents.task import (
+from gym_dgpmpc.checkpoints.collect import collect
+from gym_dgpmpc.checkpoints.format import CheckpointPath, write_checkpoint
+from gym_dgpmpc.checkpoints.restore import load_agent
+from gym_dgpmpc.errors import EnvironmentDataError
+from gym_dgpmpc.planning.plan_state import PlanState, PolicyState, pack, unpack
+from gym_dgpmpc.randomness import observation_generator
+from gym_dgpmpc.tasks.dict_observations import check_parts, flatten, layout
+from gym_dgpmpc.tasks.task import (
     flat_size,
 )
-from gym_dgpmpc.errors import EnvironmentDataError
 
 SelfAgent = TypeVar("SelfAgent", bound="PlanningAgent")
 

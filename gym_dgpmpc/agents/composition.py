@@ -16,12 +16,15 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from gym_dgpmpc.agents.dict_observations import FlatDict
-from gym_dgpmpc.agents.first_batch import REWARD_SIGNATURE
-from gym_dgpmpc.agents.modelled import ModelledVector
-from gym_dgpmpc.agents.policy import PlanningPolicy
-from gym_dgpmpc.agents.randomness import fresh_seed, split_seed
-from gym_dgpmpc.agents.task import (
+from gym_dgpmpc.checks import check_counts
+from gym_dgpmpc.data.transitions import TransitionStore
+from gym_dgpmpc.errors import UnknownRewardError
+from gym_dgpmpc.planning.controller import PlanningPolicy
+from gym_dgpmpc.randomness import fresh_seed, split_seed
+from gym_dgpmpc.tasks.dict_observations import FlatDict
+from gym_dgpmpc.tasks.first_batch import REWARD_SIGNATURE
+from gym_dgpmpc.tasks.modelled import ModelledVector
+from gym_dgpmpc.tasks.task import (
     LEARNED,
     Learned,
     Task,
@@ -31,9 +34,6 @@ from gym_dgpmpc.agents.task import (
     flat_size,
     wrapped_env,
 )
-from gym_dgpmpc.checks import check_counts
-from gym_dgpmpc.data.transitions import TransitionStore
-from gym_dgpmpc.errors import UnknownRewardError
 from gym_dgpmpc.types import (
     DynamicsFactory,
     DynamicsModel,

@@ -11,10 +11,10 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.agents.parts import cem_planner
-from gym_dgpmpc.agents.task import Learned
-from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
-from gym_dgpmpc.dynamics.deep_gp_draws import Draw, Refresh
+from gym_dgpmpc.dynamics.deep_gp.draws import Draw, Refresh
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.inference.mcem import InferenceSettings
+from gym_dgpmpc.tasks.task import Learned
 from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
 
 

@@ -11,8 +11,8 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.agents.parts import cem_planner
-from gym_dgpmpc.agents.task import LEARNED, Learned, flat_size
-from gym_dgpmpc.dynamics.sparse_gp import GPDraw, SparseGPDynamics
+from gym_dgpmpc.dynamics.sparse_gp.model import GPDraw, SparseGPDynamics
+from gym_dgpmpc.tasks.task import LEARNED, Learned, flat_size
 from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
 
 

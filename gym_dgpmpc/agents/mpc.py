@@ -17,12 +17,12 @@ from stable_baselines3.common.utils import configure_logger
 
 from gym_dgpmpc.agents.acting import ActingAgent
 from gym_dgpmpc.agents.episode import EpisodeRecord
-from gym_dgpmpc.agents.reward_guard import disagreements
-from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
 from gym_dgpmpc.agents.running import next_episode
-from gym_dgpmpc.agents.safeguard import Safeguard
-from gym_dgpmpc.agents.saving import pending_logs
+from gym_dgpmpc.checkpoints.collect import pending_logs
+from gym_dgpmpc.checkpoints.folder import RunCheckpoints
+from gym_dgpmpc.checkpoints.safeguard import Safeguard
 from gym_dgpmpc.errors import EnvironmentDataError
+from gym_dgpmpc.tasks.reward_guard import disagreements
 
 SelfAgent = TypeVar("SelfAgent", bound="MPCAgent")
 

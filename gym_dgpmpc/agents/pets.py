@@ -12,9 +12,9 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.agents.parts import cem_planner
-from gym_dgpmpc.agents.task import Learned
-from gym_dgpmpc.dynamics.ensemble import EnsembleDynamics
-from gym_dgpmpc.dynamics.ensemble_draws import Propagation
+from gym_dgpmpc.dynamics.ensemble.draws import Propagation
+from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
+from gym_dgpmpc.tasks.task import Learned
 from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
 
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gym_dgpmpc.agents.episode import EpisodeRecord
-from gym_dgpmpc.agents.plan_state import PlanState
 from gym_dgpmpc.data.transitions import TransitionStore
+from gym_dgpmpc.planning.plan_state import PlanState
 
 
 @dataclass

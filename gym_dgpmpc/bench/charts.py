@@ -15,7 +15,7 @@ from gym_dgpmpc.bench import paper, scores
 from gym_dgpmpc.bench.curves import Clock, Curve, Earned, curve, line
 from gym_dgpmpc.bench.scores import CEILING, Runs
 from gym_dgpmpc.bench.styles import Style, styles
-from gym_dgpmpc.reporting.figures import write_figure
+from gym_dgpmpc.runs.figures import write_figure
 
 CEILING_LABEL = "planner with the true dynamics"
 COLUMNS = 3

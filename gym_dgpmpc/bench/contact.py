@@ -32,10 +32,10 @@ from gym_dgpmpc.bench.contact_results import (
 )
 from gym_dgpmpc.bench.contact_scores import scores
 from gym_dgpmpc.bench.jobs import Folders
-from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.envs.mod_cartpole import ModCartPoleEnv
 from gym_dgpmpc.inference.mcem import InferenceSettings
-from gym_dgpmpc.reporting.circumstances import machine, revision, versions
+from gym_dgpmpc.runs.provenance import machine, revision, versions
 from gym_dgpmpc.types import DynamicsModel
 
 _ANGULAR_VELOCITY = 3

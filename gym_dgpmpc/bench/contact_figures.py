@@ -1,6 +1,6 @@
 """The pictures of the contact study: fans of trajectories as in the paper's supplement, and scores at each step.
 
-Drawn through Matplotlib's object interface alone, as `reporting/figures.py` does.
+Drawn through Matplotlib's object interface alone, as `runs/figures.py` does.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from gym_dgpmpc.bench import paper
 from gym_dgpmpc.bench.contact_data import find_case
 from gym_dgpmpc.bench.contact_results import QUANTITIES, UNITS, ContactResult
 from gym_dgpmpc.bench.contact_scores import LEVELS, coverage_name
-from gym_dgpmpc.reporting.figures import write_figure
+from gym_dgpmpc.runs.figures import write_figure
 
 Setting = tuple[str, int]
 """Kernel and number of layers."""

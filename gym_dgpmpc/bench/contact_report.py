@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from gym_dgpmpc.agents.files import replace_text
 from gym_dgpmpc.bench import statistics
 from gym_dgpmpc.bench.contact_data import CASES
 from gym_dgpmpc.bench.contact_figures import KERNEL_NAMES, Curve, Setting, plot_fans, plot_scores_by_step
@@ -21,6 +20,7 @@ from gym_dgpmpc.bench.contact_scores import LEVELS, SCORES, coverage_name
 from gym_dgpmpc.bench.markdown import page_and_folder, table
 from gym_dgpmpc.bench.provenance import SECTION, pairs
 from gym_dgpmpc.bench.statistics import Estimate
+from gym_dgpmpc.checkpoints.files import replace_text
 
 COMMAND = "dgpmpc bench contact"
 """What makes all runs of the study."""

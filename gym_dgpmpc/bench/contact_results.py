@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from gym_dgpmpc.agents.files import replace_text
 from gym_dgpmpc.bench.results import ResultError, read_file
+from gym_dgpmpc.checkpoints.files import replace_text
 
 SCHEMA = 1
 

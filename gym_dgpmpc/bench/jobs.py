@@ -98,7 +98,7 @@ def keep(job: Job, outcome: Outcome, results: Path) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    from gym_dgpmpc.agents.files import replace_text  # which takes seconds to import
+    from gym_dgpmpc.checkpoints.files import replace_text  # which takes seconds to import
 
     path, log = results / job.file_name, log_of(job, results)
     if outcome.content is None:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from gym_dgpmpc.bench.markdown import NOTHING, cell, table
 from gym_dgpmpc.bench.results import RunResult
 from gym_dgpmpc.bench.scores import Runs
-from gym_dgpmpc.reporting.circumstances import OPTIONAL
+from gym_dgpmpc.runs.provenance import OPTIONAL
 
 SECTION = "What the runs were made with"
 

@@ -4,7 +4,6 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gym_dgpmpc.agents.files import replace_text
 from gym_dgpmpc.bench import charts, paper, scores, tables
 from gym_dgpmpc.bench.curves import MOST_POINTS
 from gym_dgpmpc.bench.markdown import page_and_folder
@@ -12,6 +11,7 @@ from gym_dgpmpc.bench.provenance import Origins
 from gym_dgpmpc.bench.results import ResultError
 from gym_dgpmpc.bench.scores import CEILING, Runs
 from gym_dgpmpc.bench.statistics import CONFIDENCE, RESAMPLES
+from gym_dgpmpc.checkpoints.files import replace_text
 
 LEGEND = (
     f"Numbers in square brackets are {CONFIDENCE:.0%} percentile bootstrap intervals over seeds, stratified by task "

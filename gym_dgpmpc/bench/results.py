@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
-from gym_dgpmpc.agents.files import replace_text
+from gym_dgpmpc.checkpoints.files import replace_text
 from gym_dgpmpc.errors import DGPMPCError
 
 SCHEMA = 1

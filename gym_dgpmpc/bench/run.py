@@ -21,9 +21,9 @@ from gym_dgpmpc.bench.methods import METHODS, ModelFreeMethod, PlanningMethod, S
 from gym_dgpmpc.bench.results import Actions, Episode, RunKey, RunResult
 from gym_dgpmpc.bench.tasks import Task
 from gym_dgpmpc.errors import DGPMPCError, RunInUseError
-from gym_dgpmpc.reporting.circumstances import machine, revision, versions
-from gym_dgpmpc.reporting.recording import EpisodeRecorder
-from gym_dgpmpc.reporting.run import EPISODES_FILE, EpisodeRow, RunFolder, TrainingRun, read_rows, step_limit
+from gym_dgpmpc.runs.provenance import machine, revision, versions
+from gym_dgpmpc.runs.recording import EpisodeRecorder
+from gym_dgpmpc.runs.run import EPISODES_FILE, EpisodeRow, RunFolder, TrainingRun, read_rows, step_limit
 
 CHECKPOINT_EVERY = 250
 """Steps between checkpoints within an episode: the paper's half-cheetah has 1000 an episode, which may take hours."""

@@ -46,7 +46,7 @@ def use_threads(threads: int) -> None:
 
 def prepare_video(env_id: str) -> str:
     """Choose MuJoCo's way to draw off-screen, before MuJoCo is used; the result says why there is none, if so."""
-    from gym_dgpmpc.reporting.rendering import probe_rendering
+    from gym_dgpmpc.runs.rendering import probe_rendering
 
     make(env_id, render=False).close()  # so that a mistake in the id is not taken for a missing OpenGL
     rendering = probe_rendering(env_id)

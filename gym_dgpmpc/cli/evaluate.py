@@ -30,10 +30,10 @@ def evaluate(
     from stable_baselines3.common.evaluation import evaluate_policy
 
     from gym_dgpmpc.agents import MPCAgent
-    from gym_dgpmpc.agents.checkpoint import read_checkpoint
-    from gym_dgpmpc.agents.run_checkpoints import NEWEST
-    from gym_dgpmpc.reporting.recording import Episode, EpisodeRecorder
-    from gym_dgpmpc.reporting.rendering import write_gif
+    from gym_dgpmpc.checkpoints.folder import NEWEST
+    from gym_dgpmpc.checkpoints.format import read_checkpoint
+    from gym_dgpmpc.runs.recording import Episode, EpisodeRecorder
+    from gym_dgpmpc.runs.rendering import write_gif
 
     returns: list[float] = []
 

@@ -22,7 +22,7 @@ from gym_dgpmpc.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from gym_dgpmpc.reporting.run import TrainingRun
+    from gym_dgpmpc.runs.run import TrainingRun
 
 DEFAULT_EPISODES = 15
 RUN = "Run"
@@ -173,7 +173,7 @@ def _set_up_run(
 ) -> "TrainingRun":
     """The run that the options describe, with what they leave open filled in."""
     from gym_dgpmpc.agents import DGPMPCAgent
-    from gym_dgpmpc.reporting.run import RunFolder, TrainingRun, step_limit
+    from gym_dgpmpc.runs.run import RunFolder, TrainingRun, step_limit
 
     assert env.spec is not None
     env_id, max_steps = env.spec.id, env.spec.max_episode_steps

@@ -8,7 +8,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import gym_dgpmpc  # noqa: F401  # registers the environments
 from gym_dgpmpc import MPCAgent
-from gym_dgpmpc.agents.checkpoint import read_checkpoint, write_checkpoint
+from gym_dgpmpc.checkpoints.format import read_checkpoint, write_checkpoint
 from gym_dgpmpc.errors import CheckpointError
 from gym_dgpmpc.planning import CEM
 from tests.agents.point_mass import LENGTH, KnownPointMass, LinearModel, agent

@@ -21,7 +21,7 @@ from gym_dgpmpc.bench.contact_scores import crps
 from gym_dgpmpc.bench.jobs import Folders, Job, carry_out
 from gym_dgpmpc.bench.suites import ContactSuite, Narrowed, SuiteError
 from gym_dgpmpc.cli import app
-from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.envs.mod_cartpole import ModCartPoleEnv
 from tests.bench.contact_runs import TINY, made_up

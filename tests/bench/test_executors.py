@@ -10,7 +10,7 @@ from gym_dgpmpc.bench.jobs import Folders, carry_out, keep, log_of
 from gym_dgpmpc.bench.results import RunResult
 from gym_dgpmpc.bench.run import Run
 from tests.bench.toy import TINY, TOY, Errand, steps_in, toy
-from tests.reporting.toy import EPISODE_STEPS
+from tests.runs.toy import EPISODE_STEPS
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from gym_dgpmpc.bench.listing import hours, seconds_per_step, summary, survey
 from gym_dgpmpc.bench.run import Run
 from tests.bench.made_up import run
 from tests.bench.toy import TINY, TOY
-from tests.reporting.toy import EPISODE_STEPS
+from tests.runs.toy import EPISODE_STEPS
 
 DGP = "DGP-MPC L=1 matern32"
 

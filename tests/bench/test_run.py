@@ -16,7 +16,7 @@ from gym_dgpmpc.bench.results import ResultError, RunResult
 from gym_dgpmpc.bench.run import OtherRunError, Run
 from gym_dgpmpc.bench.tasks import TASKS
 from tests.bench.toy import CART_POLE, TINY, TOY, steps_in, toy
-from tests.reporting.toy import EPISODE_STEPS
+from tests.runs.toy import EPISODE_STEPS
 
 DGP = "DGP-MPC L=1 matern32"
 KINDS = [DGP, "PETS TSinf", "GP-MM"]

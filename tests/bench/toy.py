@@ -8,7 +8,7 @@ from pathlib import Path
 import gymnasium
 
 from gym_dgpmpc.bench.tasks import Task
-from tests.reporting.toy import EPISODE_STEPS, SMALLEST_AGENT, ToyPush
+from tests.runs.toy import EPISODE_STEPS, SMALLEST_AGENT, ToyPush
 
 NETWORKS = {"num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4), "num_particles": 5}
 PLANNING = {"horizon": 3, "num_candidates": 6, "num_elites": 2, "num_iterations": 1}

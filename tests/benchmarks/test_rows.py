@@ -100,7 +100,7 @@ def test_a_failing_disk_leaves_the_old_rows(benchmark, monkeypatch):
     def full(descriptor):
         raise OSError("disk full")
 
-    monkeypatch.setattr("gym_dgpmpc.agents.files.os.fsync", full)
+    monkeypatch.setattr("gym_dgpmpc.checkpoints.files.os.fsync", full)
     with pytest.raises(OSError, match="disk full"):
         benchmark("--seeds", "101")
     assert benchmark.file.read_bytes() == before

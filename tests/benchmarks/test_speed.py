@@ -13,7 +13,7 @@ from benchmarks.speed import __main__ as speed
 from benchmarks.speed.cases import CASES, transitions
 from benchmarks.speed.report import document
 from gym_dgpmpc.data.encoding import Encoder
-from gym_dgpmpc.reporting.circumstances import processor
+from gym_dgpmpc.runs.provenance import processor
 
 TASKS = {
     "cart-pole": ("ModCartPole-v0", 30, 5),

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
-from gym_dgpmpc.dynamics.ensemble import EnsembleDynamics
-from gym_dgpmpc.dynamics.ensemble_draws import PROPAGATIONS
-from gym_dgpmpc.dynamics.sparse_gp import GP_DRAWS, SparseGPDynamics
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
+from gym_dgpmpc.dynamics.ensemble.draws import PROPAGATIONS
+from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
+from gym_dgpmpc.dynamics.sparse_gp.model import GP_DRAWS, SparseGPDynamics
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.planning.rollout import rollout
 from gym_dgpmpc.types import DynamicsModel, Transitions, TransitionSampler

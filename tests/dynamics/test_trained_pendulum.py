@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.planning.rollout import rollout

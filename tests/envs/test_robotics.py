@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gym_dgpmpc import DGPMPCAgent
-from gym_dgpmpc.agents.task import environment_id, find_observation_spec, find_task, wrapped_env
+from gym_dgpmpc.tasks.task import environment_id, find_observation_spec, find_task, wrapped_env
 from gym_dgpmpc.types import ObservationSpec
 
 pytest.importorskip("gymnasium_robotics")

@@ -16,7 +16,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
-from gym_dgpmpc.agents.files import replace_text
+from gym_dgpmpc.checkpoints.files import replace_text
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results" / "reliability"
 PACKAGES = ("gymnasium", "hypothesis", "mujoco", "numpy", "safetensors", "scipy", "stable-baselines3", "torch")

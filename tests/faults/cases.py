@@ -14,7 +14,7 @@ from gymnasium import spaces
 from hypothesis import HealthCheck, Phase, given, settings
 
 from gym_dgpmpc import DGPMPCAgent
-from gym_dgpmpc.dynamics.deep_gp_draws import DRAWS, REFRESHES
+from gym_dgpmpc.dynamics.deep_gp.draws import DRAWS, REFRESHES
 from gym_dgpmpc.errors import DGPMPCError
 from gym_dgpmpc.gp.kernels import KERNELS
 

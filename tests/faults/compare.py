@@ -8,7 +8,7 @@ import torch
 from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
 from tensorboard.compat.proto.event_pb2 import Event
 
-from gym_dgpmpc.agents.checkpoint import read_checkpoint
+from gym_dgpmpc.checkpoints.format import read_checkpoint
 
 CLOCK = {"record.0.seconds", "record.0.plan_seconds", "ep_info.t"}
 """Tensors of a checkpoint that tell the time."""

@@ -23,11 +23,11 @@ import torch
 from safetensors.torch import save as save_tensors
 
 from gym_dgpmpc import DGPMPCAgent
-from gym_dgpmpc.agents.checkpoint import SCHEMA, read_checkpoint
-from gym_dgpmpc.agents.randomness import Generators
+from gym_dgpmpc.checkpoints.format import SCHEMA, read_checkpoint
 from gym_dgpmpc.errors import DGPMPCError
+from gym_dgpmpc.randomness import Generators
 from tests.faults.kills import TINY
-from tests.reporting.toy import EPISODE_STEPS
+from tests.runs.toy import EPISODE_STEPS
 
 MEMORY_BOUND = 64 << 20
 """Bytes of Python objects that reading one of these files may allocate at its peak; the files have some 50 kB."""

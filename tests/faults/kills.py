@@ -18,14 +18,14 @@ from typing import NamedTuple
 import gymnasium
 
 from gym_dgpmpc import DGPMPCAgent, cli
-from gym_dgpmpc.agents import run_checkpoints
-from gym_dgpmpc.agents.checkpoint import read_checkpoint
-from gym_dgpmpc.agents.policy import PlanningPolicy
-from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
-from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
-from gym_dgpmpc.reporting import run as _imported_before_the_fork  # noqa: F401  # with Matplotlib, which takes seconds
+from gym_dgpmpc.checkpoints import folder as run_checkpoints
+from gym_dgpmpc.checkpoints.folder import RunCheckpoints
+from gym_dgpmpc.checkpoints.format import read_checkpoint
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
+from gym_dgpmpc.planning.controller import PlanningPolicy
+from gym_dgpmpc.runs import run as _imported_before_the_fork  # noqa: F401  # with Matplotlib, which takes seconds
 from tests.faults.compare import checkpoint_differences, folder_differences, log_differences
-from tests.reporting.toy import ToyPush
+from tests.runs.toy import ToyPush
 
 PHASES = ("other", "training", "planning", "re-sampling", "checkpointing")
 STEPS = 20

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from gym_dgpmpc.agents.checkpoint import read_checkpoint, write_checkpoint
-from gym_dgpmpc.agents.run_checkpoints import RunCheckpoints
-from gym_dgpmpc.agents.saving import collect
+from gym_dgpmpc.checkpoints.collect import collect
+from gym_dgpmpc.checkpoints.folder import RunCheckpoints
+from gym_dgpmpc.checkpoints.format import read_checkpoint, write_checkpoint
 from gym_dgpmpc.errors import CheckpointWriteError, RunInUseError
 from tests.agents.point_mass import agent
 from tests.faults.compare import checkpoint_differences

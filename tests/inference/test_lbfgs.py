@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from gym_dgpmpc.dynamics.deep_gp_start import initial_model
+from gym_dgpmpc.dynamics.deep_gp.start import initial_model
 from gym_dgpmpc.gp.sgpr import collapsed_bound
 from gym_dgpmpc.inference.lbfgs import LENGTHSCALES, NOISE_VARIANCES, maximise_bound
 from gym_dgpmpc.inference.mcem import Data

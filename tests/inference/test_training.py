@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from gym_dgpmpc.dynamics.deep_gp_start import initial_model
+from gym_dgpmpc.dynamics.deep_gp.start import initial_model
 from gym_dgpmpc.errors import FactorisationError, TrainingError
 from gym_dgpmpc.inference import mcem, sghmc, training
 from gym_dgpmpc.inference.mcem import Data, InferenceSettings

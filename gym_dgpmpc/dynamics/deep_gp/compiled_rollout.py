@@ -1,0 +1,259 @@
+"""Whole rollouts of a pathwise draw in compiled code: `native/rollout.cpp`, called once per thread and objective.
+
+`PathwiseSampler` evaluates its functions with PyTorch, one step of a plan at a time; what is here takes the same
+functions through all steps at once, several times faster on a CPU and equal to it up to single-precision rounding.
+"""
+
+import ctypes
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from gym_dgpmpc.dynamics.coordinates import Coordinates
+from gym_dgpmpc.dynamics.deep_gp import compiler
+from gym_dgpmpc.gp.kernels import KERNELS, Kernel, argument_scale
+
+_Floats = ctypes.POINTER(ctypes.c_float)
+_Integers = ctypes.POINTER(ctypes.c_int64)
+
+AS_IS, SINE, COSINE, ACTION, FORWARDS, LEFTWARDS = range(6)
+
+
+class PathwiseLayer(NamedTuple):
+    """One layer's functions, ready for a rollout: two products in, two out, in the rollout's precision."""
+
+    inverse_lengthscale: Float[Tensor, "D"]
+    centres: Float[Tensor, "D M"]  # from x to the kernel's argument, with ...
+    offsets: Float[Tensor, "M"]  # ... and the factor of |x|^2, which is `argument_scale`
+    frequencies: Float[Tensor, "D F"]  # from x to the features' phases, in turns
+    phases: Float[Tensor, "F"]
+    kernel_out: Float[Tensor, "T P O M"]  # sigma^2 alpha; T = H with refresh="step", else 1
+    feature_out: Float[Tensor, "T P O F"]  # sigma sqrt(2 / F) w
+
+
+class _Layer(ctypes.Structure):
+    _fields_ = (
+        ("outputs", ctypes.c_int64),
+        ("inverse_lengthscale", _Floats),
+        ("centres", _Floats),
+        ("offsets", _Floats),
+        ("frequencies", _Floats),
+        ("phases", _Floats),
+        ("kernel_out", _Floats),
+        ("feature_out", _Floats),
+    )
+
+
+class _Task(ctypes.Structure):
+    _fields_ = (
+        ("observation_size", ctypes.c_int64),
+        ("action_size", ctypes.c_int64),
+        ("input_size", ctypes.c_int64),
+        ("num_particles", ctypes.c_int64),
+        ("num_candidates", ctypes.c_int64),
+        ("horizon", ctypes.c_int64),
+        ("num_layers", ctypes.c_int64),
+        ("num_inducing", ctypes.c_int64),
+        ("num_features", ctypes.c_int64),
+        ("num_functions", ctypes.c_int64),
+        ("kernel", ctypes.c_int64),
+        ("argument_scale", ctypes.c_float),
+        ("input_kind", _Integers),
+        ("input_source", _Integers),
+        ("input_mean", _Floats),
+        ("input_scale", _Floats),
+        ("carried", _Floats),
+        ("shift", _Floats),
+        ("spread", _Floats),
+        ("target", _Integers),
+        ("num_vectors", ctypes.c_int64),
+        ("vectors", _Integers),
+        ("layers", ctypes.POINTER(_Layer)),
+        ("start", _Floats),
+        ("actions", _Floats),
+        ("states", _Floats),
+    )
+
+
+def is_available() -> bool:
+    """Whether there is compiled code for this machine; builds it at the first call, which takes seconds."""
+    return _library() is not None
+
+
+class CompiledRollout:
+    """All trajectories of one draw.
+
+    Args:
+        kernel: of every layer.
+        layers: the functions, float32 on the CPU.
+        coordinates: raw states to standardised coordinates and back, float32.
+
+    Raises:
+        RuntimeError: there is no compiled code; see `is_available`.
+    """
+
+    def __init__(self, kernel: Kernel, layers: Sequence[PathwiseLayer], coordinates: Coordinates):
+        library = _library()
+        if library is None:
+            raise RuntimeError("there is no compiled code on this machine: ask is_available first")
+        self._library, units = library, int(library.units())
+        encoder, first = coordinates.encoder, layers[0]
+        self._kept: list[Tensor] = []  # the memory that the structures point into
+        self._layers = (_Layer * len(layers))(*(self._packed(layer, units) for layer in layers))
+        vectors = encoder.spec.body_frame
+        along_body = {x: (FORWARDS, k) for k, (_, x, _) in enumerate(vectors)}
+        along_body |= {y: (LEFTWARDS, k) for k, (_, _, y) in enumerate(vectors)}
+        inputs = [along_body.get(i, (AS_IS, i)) for i in encoder.plain]
+        inputs += [(kind, i) for kind in (SINE, COSINE) for i in encoder.angles]
+        inputs += [(ACTION, i) for i in range(encoder.action_size)]
+        target = torch.full((encoder.observation_size,), -1)
+        target[encoder.predicted] = torch.arange(encoder.target_size)
+        spread = torch.zeros(encoder.observation_size)
+        spread[encoder.predicted] = coordinates.spread
+        self._task = _Task(
+            observation_size=encoder.observation_size,
+            action_size=encoder.action_size,
+            input_size=encoder.input_size,
+            num_particles=first.kernel_out.shape[1],
+            num_layers=len(layers),
+            num_inducing=_rounded_up(first.kernel_out.shape[-1], units),
+            num_features=_rounded_up(first.feature_out.shape[-1], units),
+            num_functions=first.kernel_out.shape[0],
+            kernel=KERNELS.index(kernel),
+            argument_scale=argument_scale(kernel),
+            input_kind=self._integers(torch.tensor([kind for kind, _ in inputs])),
+            input_source=self._integers(torch.tensor([source for _, source in inputs])),
+            input_mean=self._floats(coordinates.input_mean),
+            input_scale=self._floats(coordinates.input_scale),
+            carried=self._floats(coordinates.carried),
+            shift=self._floats(coordinates.shift),
+            spread=self._floats(spread),
+            target=self._integers(target),
+            num_vectors=len(vectors),
+            vectors=self._integers(torch.tensor(vectors)),
+            layers=self._layers,
+        )
+
+    def __call__(
+        self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]
+    ) -> Float[Tensor, "H_plus_1 P K S"]:
+        """The states of every particle under every candidate, the first of them ``observation``.
+
+        Runs on as many threads as PyTorch is set to use, and gives the same values for any number of them.
+
+        Raises:
+            ValueError: the sizes are not those of the draw, or the plan has more steps than it has functions.
+            MemoryError: there was no memory for a few kilobytes per thread.
+        """
+        self._check_sizes(observation, actions)
+        num_candidates, horizon, _ = actions.shape
+        task = _Task.from_buffer_copy(self._task)
+        start = observation.to(torch.float32).contiguous()
+        actions = actions.to(torch.float32).contiguous()
+        states = actions.new_empty(horizon + 1, task.num_particles, num_candidates, task.observation_size)
+        task.num_candidates, task.horizon = num_candidates, horizon
+        task.start, task.actions, task.states = (_pointer(tensor) for tensor in (start, actions, states))
+
+        def run(first: int, last: int) -> int:
+            calls = (self._library.rollout(task, particle, first, last) for particle in range(task.num_particles))
+            return sum(calls)
+
+        # Shares of whole blocks: a block that is half full costs as much as a full one.
+        threads, points = torch.get_num_threads(), int(self._library.points())
+        share = _rounded_up(-(-num_candidates // threads), points)
+        ranges = [(first, min(first + share, num_candidates)) for first in range(0, num_candidates, share)]
+        failed = run(*ranges[0]) if len(ranges) == 1 else sum(_threads(threads).map(lambda r: run(*r), ranges))
+        if failed:
+            raise MemoryError("there was no memory for the scratch space of a rollout")
+        return states
+
+    def _check_sizes(self, observation: Tensor, actions: Tensor) -> None:
+        """The compiled code believes every size, and would read beyond the arrays."""
+        task = self._task
+        if observation.shape != (task.observation_size,):
+            raise ValueError(
+                f"the observation must have the shape ({task.observation_size},), got {tuple(observation.shape)}"
+            )
+        if actions.ndim != 3 or actions.shape[2] != task.action_size:
+            raise ValueError(f"the actions must have the shape [K, H, {task.action_size}], got {tuple(actions.shape)}")
+        if task.num_functions > 1 and actions.shape[1] > task.num_functions:
+            raise ValueError(
+                f"these worlds were drawn for plans of at most {task.num_functions} steps, got actions for "
+                f"{actions.shape[1]}"
+            )
+
+    def _packed(self, layer: PathwiseLayer, units: int) -> _Layer:
+        """A layer in the layout of the compiled code, M and F padded to whole blocks of functions that are zero."""
+        padded = _padded(layer, units)
+        return _Layer(
+            padded.kernel_out.shape[2],
+            self._floats(padded.inverse_lengthscale),
+            self._floats(_blocks(padded.centres, units)),
+            self._floats(padded.offsets),
+            self._floats(_blocks(padded.frequencies, units)),
+            self._floats(padded.phases),
+            self._floats(padded.kernel_out),
+            self._floats(padded.feature_out),
+        )
+
+    def _floats(self, values: Tensor) -> "ctypes._Pointer[ctypes.c_float]":
+        self._kept.append(values.to(torch.float32).contiguous())
+        return _pointer(self._kept[-1])
+
+    def _integers(self, values: Tensor) -> "ctypes._Pointer[ctypes.c_int64]":
+        self._kept.append(values.to(torch.int64).contiguous())
+        return ctypes.cast(self._kept[-1].data_ptr(), _Integers)
+
+
+@cache
+def _library() -> ctypes.CDLL | None:
+    library = compiler.load("rollout")
+    if library is not None:
+        library.rollout.argtypes = (ctypes.POINTER(_Task), *(ctypes.c_int64,) * 3)
+        for function in (library.rollout, library.units, library.points):
+            function.restype = ctypes.c_int64
+    return library
+
+
+@cache
+def _threads(num_threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(num_threads, thread_name_prefix="rollout")
+
+
+if hasattr(os, "register_at_fork"):  # a forked child inherits the pools, but none of their threads
+    os.register_at_fork(after_in_child=_threads.cache_clear)
+
+
+def _pointer(tensor: Tensor) -> "ctypes._Pointer[ctypes.c_float]":
+    return ctypes.cast(tensor.data_ptr(), _Floats)
+
+
+def _rounded_up(size: int, unit: int) -> int:
+    return -(-size // unit) * unit
+
+
+def _padded(layer: PathwiseLayer, units: int) -> PathwiseLayer:
+    pad_inducing, pad_features = (-tensor.shape[-1] % units for tensor in (layer.kernel_out, layer.feature_out))
+    if not pad_inducing and not pad_features:
+        return layer
+    padding = {
+        "centres": pad_inducing,
+        "offsets": pad_inducing,
+        "kernel_out": pad_inducing,
+        "frequencies": pad_features,
+        "phases": pad_features,
+        "feature_out": pad_features,
+    }
+    return layer._replace(**{name: pad(getattr(layer, name), (0, size)) for name, size in padding.items()})
+
+
+def _blocks(weights: Float[Tensor, "D n"], units: int) -> Float[Tensor, "blocks D units"]:
+    """Columns grouped as the compiled code reads them."""
+    return weights.unflatten(1, (-1, units)).movedim(1, 0)

@@ -1,0 +1,247 @@
+"""Draws of a trained deep Gaussian process: the transition samplers that a plan is made through.
+
+`DeepGPDynamics.draw` makes one of these per plan. All three draw from the posterior given one sample of the inducing
+outputs per particle; they differ in what they keep of the covariance:
+
+    joint      all candidate sequences of a step jointly, fresh noise at each step (the paper's scheme, exactly);
+    marginal   each candidate and step on its own;
+    pathwise   whole functions, by Matheron's rule: joint across candidates, and also over the steps of a plan if a
+               particle keeps its function ("plan") or not ("step", equal in law to `joint` up to F^-1/2).
+"""
+
+import math
+from functools import cached_property
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gym_dgpmpc.dynamics.coordinates import Coordinates
+from gym_dgpmpc.dynamics.deep_gp.compiled_rollout import CompiledRollout, PathwiseLayer
+from gym_dgpmpc.gp.deep_gp import DeepGP
+from gym_dgpmpc.gp.features import draw_features
+from gym_dgpmpc.gp.kernels import Kernel, argument_scale, correlation_
+from gym_dgpmpc.gp.layer import Layer, conditional, joint_conditional
+from gym_dgpmpc.gp.linalg import JITTER, cholesky
+
+Draw = Literal["pathwise", "joint", "marginal"]
+Refresh = Literal["step", "plan"]
+DRAWS: tuple[Draw, ...] = get_args(Draw)
+REFRESHES: tuple[Refresh, ...] = get_args(Refresh)
+
+
+class Posterior(NamedTuple):
+    """What a draw is made from: hyperparameters, factors L_z, and one whitened sample per particle, per layer."""
+
+    kernel: Kernel
+    model: DeepGP
+    factors: list[Float[Tensor, "M M"]]
+    whitened: list[Float[Tensor, "P M O"]]
+
+
+class ConditionalSampler:
+    """The draws `joint` and `marginal`: values from p(f | u) at each step, with fresh noise.
+
+    Factorises in the posterior's precision (float64) whatever the precision of the states. A point that is not finite
+    is NaN after the step, and no other point feels it.
+    """
+
+    def __init__(self, posterior: Posterior, coordinates: Coordinates, generator: torch.Generator, *, joint: bool):
+        self._posterior, self._coordinates, self._generator, self._joint = posterior, coordinates, generator, joint
+
+    def __call__(
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
+    ) -> Float[Tensor, "P K S"]:
+        kernel, model, factors, whitened = self._posterior
+        x = self._coordinates.encode(observation, action).to(factors[0].dtype)
+        # Jointly drawn points share a covariance, which one that is not finite would make useless for all.
+        lost = ~x.isfinite().all(-1, keepdim=True)
+        x = x.masked_fill(lost, 0.0)
+        last = len(factors) - 1
+        for index, (layer, factor, v) in enumerate(zip(model.layers, factors, whitened, strict=True)):
+            value = self._sample_layer(kernel, layer, factor, v, x)
+            x = value if index == last else x + value
+        return self._coordinates.decode(observation, x).masked_fill(lost, math.nan)
+
+    def _sample_layer(self, kernel: Kernel, layer: Layer, factor: Tensor, v: Tensor, x: Tensor) -> Tensor:
+        shape = (*x.shape[:-1], v.shape[-1])
+        noise = torch.randn(shape, generator=self._generator, dtype=x.dtype, device=x.device)
+        if not self._joint:
+            mean, variance = conditional(kernel, layer, factor, v, x)
+            return mean + variance.sqrt().unsqueeze(-1) * noise
+        mean, covariance = joint_conditional(kernel, layer, factor, v, x)
+        return mean + cholesky(covariance, layer.variance) @ noise
+
+
+def _draw_layer(
+    kernel: Kernel,
+    layer: Layer,
+    factor: Tensor,
+    whitened: Tensor,
+    num_functions: int,
+    num_features: int,
+    dtype: torch.dtype,
+    generator: torch.Generator,
+) -> PathwiseLayer:
+    """Draw ``num_functions`` functions per particle from p(f | u), by Matheron's rule.
+
+    f(x) = phi(x) . w + k(x, Z) alpha with alpha = L_z^-T (v - L_z^-1 (phi(Z) w + sqrt(jitter) e)), w, e ~ N(0, I)
+    (Wilson et al. 2020, eq. 13). The term e makes the law exact for the jittered K_zz. Frequencies, phases and phi(Z)
+    are shared, so all functions' alpha are one product of their normals (w, e) with K_zz^-1 (phi(Z), sqrt(jitter) I).
+    """
+    num_inducing, input_size = layer.inducing_inputs.shape
+    num_particles, _, outputs = whitened.shape
+    scaled = layer.inducing_inputs / layer.lengthscale
+    features = draw_features(kernel, num_features, input_size, generator, dtype=scaled.dtype)
+    columns = num_functions * num_particles * outputs
+    # Normals are drawn in single precision, which is six times faster and ample for random numbers.
+    normals = torch.randn(num_features + num_inducing, columns, generator=generator, device=scaled.device)
+    sigma = layer.variance.sqrt()
+    prior = sigma * torch.cat([features(scaled), JITTER**0.5 * torch.eye(num_inducing).to(scaled)], dim=1)
+    known = torch.linalg.solve_triangular(factor.mT, whitened.movedim(0, 1).flatten(1), upper=True)
+    if columns < len(normals):
+        response = torch.cholesky_solve(prior @ normals.to(scaled.dtype), factor)
+    else:
+        response = torch.cholesky_solve(prior, factor) @ normals.to(scaled.dtype)
+    alpha = known.unsqueeze(1) - response.unflatten(1, (num_functions, -1))
+
+    def per_function(matrix: Float[Tensor, "n columns"]) -> Float[Tensor, "T P O n"]:
+        return matrix.to(dtype).mT.contiguous().unflatten(0, (num_functions, num_particles, outputs))
+
+    scale = argument_scale(kernel)
+    return PathwiseLayer(
+        (1.0 / layer.lengthscale).to(dtype),
+        (-2.0 * scale * scaled.mT).to(dtype),
+        (scale * scaled.square().sum(-1)).to(dtype),
+        (features.frequency.mT / (2 * math.pi)).to(dtype),
+        (features.phase / (2 * math.pi)).to(dtype),
+        per_function(layer.variance * alpha.flatten(1)),
+        per_function(sigma * (2.0 / num_features) ** 0.5 * normals[:num_features]),
+    )
+
+
+class PathwiseSampler:
+    """The draw `pathwise`: P functions (or P per step), evaluated with matrix products and elementwise maps only.
+
+    Args:
+        posterior: one whitened sample per particle.
+        coordinates: raw states to standardised coordinates and back.
+        horizon: number of functions per particle with ``refresh="step"``.
+        num_features: F.
+        refresh: "step" or "plan".
+        dtype: precision of the rollout; the functions themselves are solved for in the posterior's precision.
+        generator: of the posterior's device.
+    """
+
+    def __init__(
+        self,
+        posterior: Posterior,
+        coordinates: Coordinates,
+        horizon: int,
+        num_features: int,
+        refresh: Refresh,
+        dtype: torch.dtype,
+        generator: torch.Generator,
+    ):
+        kernel, model, factors, whitened = posterior
+        num_functions = horizon if refresh == "step" else 1
+        self.kernel, self.coordinates, self._by_step = kernel, coordinates, refresh == "step"
+        self.layers = [
+            _draw_layer(kernel, layer, factor, v, num_functions, num_features, dtype, generator)
+            for layer, factor, v in zip(model.layers, factors, whitened, strict=True)
+        ]
+        self._buffers: _Buffers | None = None
+
+    def __call__(
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
+    ) -> Float[Tensor, "P K S"]:
+        x = self.coordinates.encode(observation, action)
+        if self._buffers is None or self._buffers.augmented.shape[:2] != x.shape[:2]:
+            self._buffers = _Buffers.allocate(x, self.layers[0])
+        function = step if self._by_step else 0
+        for layer, weights in zip(self.layers[:-1], self._in_weights, strict=False):
+            x = x + self._evaluate(layer, weights, x, function, self._buffers)
+        target = self._evaluate(self.layers[-1], self._in_weights[-1], x, function, self._buffers)
+        return self.coordinates.decode(observation, target)
+
+    @cached_property
+    def _in_weights(self) -> list[tuple[Tensor, Tensor]]:
+        """Of each layer, from (x, |x|^2, 1) to the kernel's argument "D+2 M" and to the features' phases "D+2 F"."""
+        scale = argument_scale(self.kernel)
+        weights = []
+        for layer in self.layers:
+            square = torch.full_like(layer.offsets, scale)
+            distance = torch.cat([layer.centres, torch.stack([square, layer.offsets])])
+            turns = torch.cat([layer.frequencies, torch.stack([torch.zeros_like(layer.phases), layer.phases])])
+            weights.append((distance, 2 * math.pi * turns))
+        return weights
+
+    def _evaluate(
+        self, layer: PathwiseLayer, weights: tuple[Tensor, Tensor], x: Tensor, function: int, buffers: "_Buffers"
+    ) -> Tensor:
+        """f(x) - m(x) "P K O" of every particle's function."""
+        augmented, correlations, decay, waves = buffers
+        size, group = x.shape[-1], correlations.shape[0]
+        scaled = augmented[..., :size]
+        torch.mul(x, layer.inverse_lengthscale, out=scaled)
+        torch.linalg.vecdot(scaled, scaled, out=augmented[..., size])
+        kernel_out, feature_out = layer.kernel_out[function].mT, layer.feature_out[function].mT
+        out = x.new_empty(*x.shape[:2], kernel_out.shape[-1])
+        for first in range(0, len(x), group):
+            own = slice(first, first + group)
+            points = augmented[own].flatten(0, 1)
+            torch.mm(points, weights[0], out=correlations.view(len(points), -1))
+            torch.mm(points, weights[1], out=waves.view(len(points), -1))
+            correlation_(self.kernel, correlations, decay)
+            torch.bmm(waves.cos_(), feature_out[own], out=out[own])
+            out[own].baddbmm_(correlations, kernel_out[own])
+        return out
+
+
+class CompiledPathwiseSampler(PathwiseSampler):
+    """A `PathwiseSampler` that offers whole trajectories in compiled code; float32 on the CPU.
+
+    Raises:
+        RuntimeError: there is no compiled code on this machine; see `compiled_rollout.is_available`.
+    """
+
+    def __init__(
+        self,
+        posterior: Posterior,
+        coordinates: Coordinates,
+        horizon: int,
+        num_features: int,
+        refresh: Refresh,
+        generator: torch.Generator,
+    ):
+        super().__init__(posterior, coordinates, horizon, num_features, refresh, torch.float32, generator)
+        self._rollout = CompiledRollout(self.kernel, self.layers, coordinates)
+
+    def trajectories(
+        self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]
+    ) -> Float[Tensor, "H_plus_1 P K S"]:
+        """The states of every particle under every candidate; see `CompiledRollout`."""
+        return self._rollout(observation, actions)
+
+
+class _Buffers(NamedTuple):
+    """Scratch of a rollout step, allocated once per sampler."""
+
+    augmented: Float[Tensor, "P K D+2"]  # (x, |x|^2, 1)
+    correlations: Float[Tensor, "G K M"]
+    decay: Float[Tensor, "G K M"]
+    waves: Float[Tensor, "G K F"]
+
+    @classmethod
+    def allocate(cls, x: Float[Tensor, "P K D"], layer: PathwiseLayer) -> "_Buffers":
+        """Room for G particles at a time: one on a CPU, so that its values stay in the cache; all on a GPU."""
+        num_particles, num_points, size = x.shape
+        group = 1 if x.device.type == "cpu" else num_particles
+        num_inducing, num_features = layer.offsets.numel(), layer.phases.numel()
+        return cls(
+            x.new_ones(num_particles, num_points, size + 2),
+            x.new_empty(group, num_points, num_inducing),
+            x.new_empty(group, num_points, num_inducing),
+            x.new_empty(group, num_points, num_features),
+        )

@@ -1,0 +1,313 @@
+"""The paper's dynamics model: a deep Gaussian process over transitions, sampled by SG-HMC.
+
+Prepares data for `inference/`, keeps what it returns (hyperparameters, chain, pool of posterior samples), and makes
+the draws of `deep_gp_draws.py` from the pool. The agent calls `fit` at an episode's start, `resample` after each
+control step and `draw` for each plan.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gym_dgpmpc.checks import check_counts
+from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.dynamics.coordinates import Coordinates
+from gym_dgpmpc.dynamics.deep_gp import compiled_rollout
+from gym_dgpmpc.dynamics.deep_gp.draws import (
+    DRAWS,
+    REFRESHES,
+    CompiledPathwiseSampler,
+    ConditionalSampler,
+    Draw,
+    PathwiseSampler,
+    Posterior,
+    Refresh,
+)
+from gym_dgpmpc.dynamics.deep_gp.start import initial_model, relocate, restandardise
+from gym_dgpmpc.dynamics.learner import Learner
+from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
+from gym_dgpmpc.errors import FactorisationError
+from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
+from gym_dgpmpc.gp.kernels import Kernel, check_kernel
+from gym_dgpmpc.inference import mcem, sghmc, training
+from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
+from gym_dgpmpc.inference.mcem import Data, InferenceSettings
+from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
+
+
+class _Fitted(NamedTuple):
+    """What a fit leaves behind, and a `resample` moves on."""
+
+    model: DeepGP
+    normalisers: tuple[Normaliser, Normaliser]
+    chain: sghmc.SGHMCState
+    pool: Tensor  # "num_samples V", a ring
+    oldest: int  # the row of the pool that the next sample replaces
+    step_size: float  # of SG-HMC: the one asked for, unless training had to take smaller steps
+
+
+class _Standardised(NamedTuple):
+    """A `DataSource` that encodes and standardises only the rows that are asked for: cost independent of N."""
+
+    encode: Callable[[Transitions], tuple[Tensor, Tensor]]
+    transitions: Transitions
+    normalisers: tuple[Normaliser, Normaliser]
+
+    @property
+    def num_rows(self) -> int:
+        return self.transitions.observation.shape[0]
+
+    def rows(self, index: Tensor) -> Data:
+        # The store is on the CPU, whatever the model's device.
+        picked = index.to(self.transitions.observation.device)
+        x, y = self.encode(Transitions(*(field[picked] for field in self.transitions)))
+        return Data(self.normalisers[0](x), self.normalisers[1](y))
+
+
+class DeepGPDynamics(Learner[_Fitted]):
+    """Implements `DynamicsModel` with a deep Gaussian process of L layers.
+
+    Args:
+        observation_size: S.
+        action_size: A.
+        observation_spec: how to read the observation.
+        num_layers: L, at least 1.
+        kernel: of every layer, with one lengthscale per input dimension.
+        num_inducing: M, inducing points per layer.
+        draw: "pathwise", "joint" or "marginal"; see `deep_gp_draws`.
+        refresh: for "pathwise": a new function per particle at each "step" of a plan, or one for the whole "plan".
+        num_features: F, random features of a pathwise draw; its prior covariance errs by F^-1/2.
+        first_iterations: training iterations (one SG-HMC and one Adam step each) of the first fit.
+        iterations: training iterations of each later fit.
+        num_samples: size of the pool of posterior samples.
+        sample_spacing: SG-HMC steps between two samples of the pool.
+        resample_steps: SG-HMC steps of one `resample`; 0 leaves the posterior as it is within an episode.
+        resample_samples: samples of the pool that one `resample` replaces, if the last layer is drawn exactly; at
+            least 1 (``resample_steps=0`` turns re-sampling off).
+        relocate: move the inducing inputs to the grown data's cluster centres before each later fit.
+        inference: settings of the sampler and the optimiser.
+        compile: roll pathwise draws out in compiled code, several times faster; where there is no compiler, or for
+            another precision or device, PyTorch does it.
+        dtype: precision of rollouts; training and every factorisation are in float64.
+        device: where tensors live.
+
+    Raises:
+        ValueError: a setting is out of its range.
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        observation_spec: ObservationSpec | None = None,
+        *,
+        num_layers: int = 2,
+        kernel: str = "matern32",
+        num_inducing: int = 200,
+        draw: Draw = "pathwise",
+        refresh: Refresh = "step",
+        num_features: int = 128,
+        first_iterations: int = 4000,
+        iterations: int = 1000,
+        num_samples: int = 100,
+        sample_spacing: int = 10,
+        resample_steps: int = 10,
+        resample_samples: int = 5,
+        relocate: bool = True,
+        inference: InferenceSettings | None = None,
+        compile: bool = True,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ):
+        check_counts(
+            num_layers=num_layers,
+            num_inducing=num_inducing,
+            num_features=num_features,
+            first_iterations=first_iterations,
+            iterations=iterations,
+            num_samples=num_samples,
+            sample_spacing=sample_spacing,
+            resample_samples=resample_samples,
+        )
+        if resample_steps < 0:
+            raise ValueError(f"resample_steps must be at least 0, received {resample_steps}")
+        if draw not in DRAWS:
+            raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(DRAWS)}")
+        if refresh not in REFRESHES:
+            raise ValueError(f"unknown refresh {refresh!r}: expected one of {', '.join(REFRESHES)}")
+        super().__init__(observation_size, action_size, observation_spec, dtype, device)
+        self.kernel: Kernel = check_kernel(kernel)
+        self.num_layers, self.num_inducing, self.num_features = num_layers, num_inducing, num_features
+        self.draw_kind, self.refresh = draw, refresh
+        self.first_iterations, self.iterations = first_iterations, iterations
+        self.num_samples, self.sample_spacing, self.resample_steps = num_samples, sample_spacing, resample_steps
+        self.relocate, self.resample_samples = relocate, min(resample_samples, num_samples)
+        self.inference = inference or InferenceSettings()
+        self.compile = compile and dtype == torch.float32 and self.device.type == "cpu"
+        self._factors: list[Tensor] = []  # L_z of every layer; derived from the hyperparameters, so not saved
+
+    def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
+        """Train on all transitions: moving-window MCEM, then a fresh pool of posterior samples.
+
+        The first fit starts from the data, later ones from the present posterior.
+
+        Raises:
+            ValueError: there are no transitions.
+            TrainingError: training diverged however small its steps; the model is as it was.
+        """
+        normalisers, standardised = self._standardised(data)
+        if self._fitted is None:
+            iterations = self.first_iterations
+            model = initial_model(standardised, self.num_layers, self.num_inducing, generator)
+            whitened = standardised.x.new_zeros(model.num_whitened())
+        else:
+            iterations, last = self.iterations, self._fitted
+            model, whitened = restandardise(last.model, last.chain.position, last.normalisers, normalisers)
+            if self.relocate:
+                model, whitened = relocate(self.kernel, model, whitened, standardised, generator)
+        trained = training.train(
+            self.kernel, model, sghmc.init(whitened), standardised, iterations, generator, self.inference
+        )
+        sampled = training.sample_pool(
+            self.kernel,
+            trained.model,
+            trained.chain,
+            standardised,
+            self.num_samples,
+            self.sample_spacing,
+            generator,
+            trained.settings,
+        )
+        self._fitted = _Fitted(trained.model, normalisers, sampled.chain, sampled.pool, 0, sampled.step_size)
+        self._factors = factorise_all(self.kernel, trained.model)
+        counts = {"iterations": float(trained.num_iterations), "rollbacks": float(trained.num_rollbacks)}
+        return {"negative_log_joint": trained.negative_log_joint} | counts | self._diagnostics(self._fitted)
+
+    def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
+        """Follow the grown data: the newest samples take the places of the pool's oldest.
+
+        They are ``resample_samples`` exact draws of the last layer, after a few SG-HMC steps over all layers; without
+        exact draws (``gibbs_every=0``) the position that those steps lead to. A chain that leaves what is plausible is
+        dropped, and the pool stays as it was.
+
+        Returns:
+            ``resamplings_dropped``: 1 if that happened, otherwise 0; nothing if there are no steps to take.
+
+        Raises:
+            RuntimeError: the model was not fitted.
+        """
+        fitted = self._require_fit("resample")
+        if self.resample_steps == 0:
+            return {}
+        try:
+            chain, newest = self._newest_samples(fitted, data, generator)
+        except FactorisationError:  # of an exact draw: the steps before it led to what is not finite
+            return {"resamplings_dropped": 1.0}
+        if not training.is_plausible(newest):
+            return {"resamplings_dropped": 1.0}
+        rows = (fitted.oldest + torch.arange(len(newest))) % self.num_samples
+        fitted.pool[rows] = newest
+        self._fitted = fitted._replace(chain=chain, oldest=(fitted.oldest + len(newest)) % self.num_samples)
+        return {"resamplings_dropped": 0.0}
+
+    def _newest_samples(
+        self, fitted: _Fitted, data: Transitions, generator: torch.Generator
+    ) -> tuple[sghmc.SGHMCState, Float[Tensor, "n V"]]:
+        """The chain some steps on, and the samples for the pool, of which the last is where the chain then is."""
+        kernel, model, factors = self.kernel, fitted.model, self._factors
+        standardised = _Standardised(self._encode, data, fitted.normalisers)
+        settings = replace(self.inference, step_size=fitted.step_size)
+        without_gibbs = replace(settings, gibbs_every=0)
+        (chain,) = mcem.sample(
+            kernel, model, fitted.chain, standardised, 1, self.resample_steps, generator, without_gibbs, factors
+        )
+        if not settings.gibbs_every:
+            return chain, chain.position.unsqueeze(0)
+        newest = mcem.gibbs_positions(
+            kernel, model, factors, chain, standardised, self.resample_samples, generator, settings
+        )
+        return chain._replace(position=newest[-1]), newest
+
+    def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
+        """One sample of the pool per particle (distinct while the pool lasts), for plans of ``horizon`` steps.
+
+        Raises:
+            RuntimeError: the model was not fitted.
+        """
+        fitted = self._require_fit("draw")
+        order = torch.randperm(self.num_samples, generator=generator, device=self.device)
+        picked = order.repeat(math.ceil(num_particles / self.num_samples))[:num_particles]
+        whitened = fitted.model.split(fitted.pool[picked])
+        posterior = Posterior(self.kernel, fitted.model, self._factors, whitened)
+        coordinates = Coordinates(self.encoder, *fitted.normalisers, self.dtype)
+        if self.draw_kind == "pathwise":
+            settings = posterior, coordinates, horizon, self.num_features, self.refresh
+            if self.compile and compiled_rollout.is_available():
+                return CompiledPathwiseSampler(*settings, generator)
+            return PathwiseSampler(*settings, self.dtype, generator)
+        return ConditionalSampler(posterior, coordinates, generator, joint=self.draw_kind == "joint")
+
+    def state_dict(self) -> StateDict:
+        """Hyperparameters, normalisers, the chain and the whole pool of samples; empty before the first fit."""
+        if self._fitted is None:
+            return {}
+        fitted = self._fitted
+        # The pool is the one tensor that changes in place, and a state should not change after it was taken.
+        state: StateDict = {"pool": fitted.pool.clone(), "oldest": fitted.oldest, "log_noise": fitted.model.log_noise}
+        if fitted.step_size != self.inference.step_size:  # states of before it was kept do not have it either
+            state["step_size"] = fitted.step_size
+        for index, layer in enumerate(fitted.model.layers):
+            state |= {f"layers.{index}.{name}": value for name, value in layer._asdict().items()}
+        state |= normalisers_state(*fitted.normalisers)
+        return state | {f"chain.{name}": value for name, value in fitted.chain._asdict().items()}
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore `state_dict` of a model with the same settings.
+
+        Raises:
+            ValueError: an entry is missing or is not what these settings give it; the model stays as it was.
+        """
+        if not state:
+            self._fitted, self._factors = None, []
+            return
+        size, num_targets, device = self.encoder.input_size, self.encoder.target_size, self.device
+        whitened = self.num_inducing * (size * (self.num_layers - 1) + num_targets)
+
+        def take(name: str, *shape: int) -> Tensor:
+            return take_tensor(state, name, shape, device)
+
+        layers = (take_layer(state, f"layers.{i}.", self.num_inducing, size, device) for i in range(self.num_layers))
+        model = DeepGP(tuple(layers), take("log_noise", num_targets))
+        normalisers = (
+            take_normaliser(state, "inputs", size, device),
+            take_normaliser(state, "targets", num_targets, device),
+        )
+        chain = sghmc.SGHMCState(*(take(f"chain.{name}", whitened) for name in sghmc.SGHMCState._fields))
+        pool, oldest = take("pool", self.num_samples, whitened), state.get("oldest")
+        if not isinstance(oldest, int) or not 0 <= oldest < self.num_samples:
+            raise ValueError(
+                f"dynamics state 'oldest': expected a row of the pool, 0 to {self.num_samples - 1}, received {oldest!r}"
+            )
+        step_size = state.get("step_size", self.inference.step_size)
+        if not isinstance(step_size, float) or not 0.0 < step_size < math.inf:
+            raise ValueError(f"dynamics state 'step_size': expected a positive number, received {step_size!r}")
+        self._factors = factorise_all(self.kernel, model)
+        self._fitted = _Fitted(model, normalisers, chain, pool, oldest, step_size)
+
+    def _diagnostics(self, fitted: _Fitted) -> dict[str, float]:
+        """Mixing of the kept samples (medians over coordinates), and the fitted noise and kernel scales."""
+        metrics = {
+            "effective_sample_size": float(effective_sample_size(fitted.pool).median()),
+            "gradient_norm": float(fitted.chain.gradient.norm()),
+            "noise_std": float(fitted.model.noise_variance.sqrt().mean()),
+        }
+        if self.num_samples >= 4:
+            metrics["r_hat"] = float(split_r_hat(fitted.pool).median())
+        for index, layer in enumerate(fitted.model.layers):
+            metrics[f"layer_{index + 1}_kernel_std"] = float(layer.variance.sqrt())
+        return metrics

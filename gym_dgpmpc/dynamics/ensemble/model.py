@@ -1,0 +1,270 @@
+"""The dynamics model of PETS: an ensemble of probabilistic networks, each trained on a resampling of the data.
+
+Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials using Probabilistic Dynamics Models". The
+networks are in `ensemble_network.py`, the draws in `ensemble_draws.py`.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gym_dgpmpc.checks import check_counts
+from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.dynamics.coordinates import Coordinates
+from gym_dgpmpc.dynamics.ensemble.draws import PROPAGATIONS, CollapsedEnsemble, EnsembleSampler, Propagation
+from gym_dgpmpc.dynamics.ensemble.network import (
+    Ensemble,
+    half_precision,
+    initial_ensemble,
+    layer_sizes,
+    loss,
+    predict,
+)
+from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
+from gym_dgpmpc.dynamics.learner import Learner
+from gym_dgpmpc.dynamics.state import take_normaliser, take_tensor
+from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
+
+
+class _Moments(NamedTuple):
+    """What Adam remembers of one parameter between two trainings."""
+
+    first: Tensor
+    second: Tensor
+
+
+class _Fitted(NamedTuple):
+    network: Ensemble
+    inputs: Normaliser
+    moments: dict[str, _Moments]
+    num_updates: int  # of Adam, over all trainings
+
+
+class EnsembleDynamics(Learner[_Fitted]):
+    """Implements `DynamicsModel` with an ensemble of B probabilistic networks.
+
+    Inputs are standardised at each training, targets are not; the networks and Adam go on from where the last training
+    left them. Within an episode nothing is learned.
+
+    Args:
+        observation_size: S.
+        action_size: A.
+        observation_spec: how to read the observation.
+        num_members: B, networks.
+        num_hidden_layers: layers between inputs and outputs.
+        hidden_size: width of each of them.
+        weight_decay: of every layer's weights, the last layer's included; the loss holds decay / 2 |W|^2.
+        learning_rate: of Adam.
+        batch_size: transitions per member and gradient.
+        num_epochs: passes over the data in one training.
+        draw: "TS1", "TSinf", "DS", "MM" or "expectation"; see `ensemble_draws`.
+        half_precision: in rollouts, compute the layers between the first and the last in bfloat16: faster by a
+            multiple on processors with instructions for it, and off by some 0.3 % of a prediction.
+        dtype: precision of all else in rollouts; networks are trained in float32.
+        device: where tensors live.
+
+    Raises:
+        ValueError: a setting is out of its range.
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        observation_spec: ObservationSpec | None = None,
+        *,
+        num_members: int = 5,
+        num_hidden_layers: int = 3,
+        hidden_size: int = 500,
+        weight_decay: Sequence[float] = (1e-4, 2.5e-4, 2.5e-4, 5e-4),
+        learning_rate: float = 1e-3,
+        batch_size: int = 32,
+        num_epochs: int = 5,
+        draw: Propagation = "TSinf",
+        half_precision: bool = False,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ):
+        check_counts(
+            num_members=num_members,
+            num_hidden_layers=num_hidden_layers,
+            hidden_size=hidden_size,
+            batch_size=batch_size,
+            num_epochs=num_epochs,
+        )
+        if len(weight_decay) != num_hidden_layers + 1 or not all(0 <= decay < math.inf for decay in weight_decay):
+            raise ValueError(
+                f"weight_decay must hold one number that is not negative for each of the {num_hidden_layers} hidden "
+                f"layers and one for the last, received {weight_decay}"
+            )
+        if not 0 < learning_rate < math.inf:
+            raise ValueError(f"learning_rate must be positive, received {learning_rate}")
+        if draw not in PROPAGATIONS:
+            raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(PROPAGATIONS)}")
+        super().__init__(observation_size, action_size, observation_spec, dtype, device)
+        self.num_members, self.weight_decay, self.learning_rate = num_members, tuple(weight_decay), learning_rate
+        self.batch_size, self.num_epochs, self.draw_kind = batch_size, num_epochs, draw
+        self.sizes = layer_sizes(self.encoder.input_size, num_hidden_layers, hidden_size, self.encoder.target_size)
+        self.half_precision = half_precision
+
+    def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
+        """Train every network on N transitions drawn with replacement, for some epochs.
+
+        Raises:
+            ValueError: there are no transitions.
+        """
+        raw, targets = self._encode(data)
+        inputs = Normaliser.fit(raw)
+        x, y = inputs(raw).float(), targets.float()
+        if self._fitted is None:
+            network = initial_ensemble(self.num_members, self.sizes, generator, self.device)
+            moments, updates = dict[str, _Moments](), 0
+        else:
+            network, _, moments, updates = self._fitted
+        self._fitted, last_loss = self._train(network, moments, updates, inputs, x, y, generator)
+        with torch.no_grad():
+            mean, logvar = predict(self._fitted.network, x.expand(self.num_members, -1, -1))
+        return {
+            "loss": last_loss,
+            "rmse": float((mean.mean(0) - y).square().mean().sqrt()),
+            "aleatoric_std": float(torch.exp(0.5 * logvar).mean()),
+            "disagreement": float(mean.std(0, correction=0).mean()),
+        }
+
+    def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
+        """Nothing: the networks are trained between episodes only.
+
+        Raises:
+            RuntimeError: the model was not fitted.
+        """
+        self._require_fit("resample")
+        return {}
+
+    def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
+        """Particles for plans of ``horizon`` steps.
+
+        Raises:
+            RuntimeError: the model was not fitted.
+            ValueError: the particles of a "TS1" or "TSinf" draw cannot be shared out evenly over the networks.
+        """
+        fitted = self._require_fit("draw")
+        network = Ensemble.from_parameters(
+            {name: value.to(self.dtype) for name, value in fitted.network.parameters().items()}
+        )
+        network = half_precision(network) if self.half_precision else network
+        coordinates = Coordinates(self.encoder, fitted.inputs, _unit(self.encoder.target_size, self.device), self.dtype)
+        if self.draw_kind in ("TS1", "TSinf"):
+            if num_particles < 1 or num_particles % self.num_members:
+                raise ValueError(
+                    f"the draw {self.draw_kind} needs a multiple of the ensemble's {self.num_members} members as "
+                    f"number of particles, received {num_particles}"
+                )
+            shuffle = self.draw_kind == "TS1" and self.num_members > 1
+            return EnsembleSampler(network, coordinates, generator, shuffle=shuffle)
+        return GaussianSampler(
+            CollapsedEnsemble(network, with_variance=self.draw_kind != "expectation"),
+            coordinates,
+            generator,
+            match_moments=self.draw_kind == "MM",
+        )
+
+    def state_dict(self) -> StateDict:
+        """Networks, input normaliser and what Adam remembers; empty before the first fit."""
+        if self._fitted is None:
+            return {}
+        network, inputs, moments, num_updates = self._fitted
+        state: StateDict = {**network.parameters(), "adam.num_updates": num_updates}
+        state |= {f"inputs.{key}": value for key, value in inputs._asdict().items()}
+        for name, pair in moments.items():
+            state |= {f"adam.{name}.{key}": value for key, value in pair._asdict().items()}
+        return state
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore `state_dict` of a model with the same settings.
+
+        Raises:
+            ValueError: an entry is missing or is not what these settings give it; the model stays as it was.
+        """
+        if not state:
+            self._fitted = None
+            return
+
+        shapes = self._shapes()
+        device, single = self.device, torch.float32
+        network = Ensemble.from_parameters(
+            {name: take_tensor(state, name, shape, device, single) for name, shape in shapes.items()}
+        )
+        inputs = take_normaliser(state, "inputs", self.encoder.input_size, device)
+        moments = {
+            name: _Moments(
+                *(take_tensor(state, f"adam.{name}.{key}", shape, device, single) for key in _Moments._fields)
+            )
+            for name, shape in shapes.items()
+        }
+        num_updates = state.get("adam.num_updates")
+        if not isinstance(num_updates, int) or num_updates < 1:
+            raise ValueError(
+                f"dynamics state 'adam.num_updates': expected a positive integer, received {num_updates!r}"
+            )
+        self._fitted = _Fitted(network, inputs, moments, num_updates)
+
+    def _train(
+        self,
+        network: Ensemble,
+        moments: dict[str, _Moments],
+        num_updates: int,
+        inputs: Normaliser,
+        x: Float[Tensor, "N D"],
+        y: Float[Tensor, "N T"],
+        generator: torch.Generator,
+    ) -> tuple[_Fitted, float]:
+        """Every member's own bootstrap, shuffled for each epoch; the mean loss of the last epoch."""
+        parameters = {name: value.clone().requires_grad_() for name, value in network.parameters().items()}
+        network = Ensemble.from_parameters(parameters)
+        # Adam's own decay adds decay * W to the gradient, which is that of decay / 2 |W|^2, without a pass of its own.
+        groups: list[dict[str, Any]] = [
+            {"params": [weight], "weight_decay": decay}
+            for weight, decay in zip(network.weights, self.weight_decay, strict=True)
+        ]
+        groups.append({"params": [*network.biases, network.max_logvar, network.min_logvar]})
+        adam = torch.optim.Adam(groups, lr=self.learning_rate)
+        for name, pair in moments.items():
+            first, second = (moment.clone() for moment in pair)
+            adam.state[parameters[name]] = {
+                "step": torch.tensor(float(num_updates)), "exp_avg": first, "exp_avg_sq": second,
+            }  # fmt: skip
+        rows = torch.randint(len(x), (self.num_members, len(x)), generator=generator, device=x.device)
+        for _ in range(self.num_epochs):
+            order = torch.rand(rows.shape, generator=generator, device=x.device).argsort(1)
+            losses = []
+            for batch in rows.gather(1, order).split(self.batch_size, dim=1):
+                with torch.enable_grad():
+                    value = loss(network, x[batch], y[batch])
+                adam.zero_grad()
+                value.backward()
+                adam.step()
+                losses.append(value.detach())
+                num_updates += 1
+        trained = Ensemble.from_parameters({name: value.detach() for name, value in parameters.items()})
+        moments = {
+            name: _Moments(adam.state[value]["exp_avg"], adam.state[value]["exp_avg_sq"])
+            for name, value in parameters.items()
+        }
+        return _Fitted(trained, inputs, moments, num_updates), float(torch.stack(losses).mean())
+
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shape of every parameter."""
+        shapes: dict[str, tuple[int, ...]] = {}
+        for i, (inputs, outputs) in enumerate(self.sizes):
+            shapes[f"layers.{i}.weight"] = (self.num_members, inputs, outputs)
+            shapes[f"layers.{i}.bias"] = (self.num_members, 1, outputs)
+        return shapes | dict.fromkeys(("max_logvar", "min_logvar"), (self.encoder.target_size,))
+
+
+def _unit(size: int, device: torch.device) -> Normaliser:
+    """The identity: the targets are not standardised."""
+    return Normaliser(*(torch.full((size,), value, dtype=torch.float64, device=device) for value in (0.0, 1.0)))

@@ -1,0 +1,217 @@
+"""The Gaussian-process model that PETS is compared with: one sparse layer, trained by the collapsed bound.
+
+Chua et al. (2018) call it GP, with the propagations DS ("distribution sampling") and MM ("moment matching"). The bound
+is in `gp/sgpr.py`, its optimisation in `inference/lbfgs.py`, the draws in `gaussian_draws.py` and, with analytic
+moments, in `moment_matching.py`.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from torch import Tensor
+
+from gym_dgpmpc.checks import check_counts
+from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.dynamics.coordinates import Coordinates
+from gym_dgpmpc.dynamics.deep_gp.start import NOISE_VARIANCE, restandardise
+from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
+from gym_dgpmpc.dynamics.learner import Learner
+from gym_dgpmpc.dynamics.sparse_gp.moment_matching import MomentMatchingSampler
+from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
+from gym_dgpmpc.gp.deep_gp import DeepGP
+from gym_dgpmpc.gp.kernels import Kernel, check_kernel
+from gym_dgpmpc.gp.layer import Layer
+from gym_dgpmpc.gp.moments import Predictor
+from gym_dgpmpc.gp.sgpr import SparsePosterior, shrinkage, sparse_posterior, sparse_predict
+from gym_dgpmpc.inference.lbfgs import maximise_bound
+from gym_dgpmpc.inference.mcem import Data
+from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
+
+GPDraw = Literal["DS", "MM", "AMM"]
+GP_DRAWS: tuple[GPDraw, ...] = get_args(GPDraw)
+
+
+class _Fitted(NamedTuple):
+    model: DeepGP  # of one layer
+    normalisers: tuple[Normaliser, Normaliser]
+    posterior: SparsePosterior
+
+
+class SparseGPDynamics(Learner[_Fitted]):
+    """Implements `DynamicsModel` with one sparse Gaussian process, its kernel shared by the outputs.
+
+    Inputs and targets are standardised at each training. Inducing inputs start from training inputs drawn at random,
+    anew at each training; hyperparameters from where the last training left them.
+
+    Args:
+        observation_size: S.
+        action_size: A.
+        observation_spec: how to read the observation.
+        kernel: with one lengthscale per input dimension.
+        num_inducing: M, inducing points; of fewer transitions, each is one.
+        exact: make every transition an inducing point and keep it there, which is the exact Gaussian process up to the
+            jitter. Cost grows with the cube of the number of transitions: for small data.
+        max_iterations: of the optimiser, in each training.
+        draw: how particles move: "DS", each by its own draw from the Gaussian at its place; "MM", as DS, then the
+            particles of a candidate are replaced by draws from their mean and variance; "AMM", a Gaussian per
+            candidate through its exact moments (kernel "rbf", more particles than an observation has numbers).
+        add_noise: draw the observations' noise too; PETS draws the function alone.
+        update_within_episode: condition on each new transition at once, hyperparameters and inducing inputs frozen (if
+            ``exact``, each is one more inducing input); PETS does so between episodes only.
+        dtype: precision of a rollout's states; the model itself computes in float64.
+        device: where tensors live.
+
+    Raises:
+        ValueError: a setting is out of its range.
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        observation_spec: ObservationSpec | None = None,
+        *,
+        kernel: str = "rbf",
+        num_inducing: int = 200,
+        exact: bool = False,
+        max_iterations: int = 200,
+        draw: GPDraw = "DS",
+        add_noise: bool = False,
+        update_within_episode: bool = False,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ):
+        check_counts(num_inducing=num_inducing, max_iterations=max_iterations)
+        if draw not in GP_DRAWS:
+            raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(GP_DRAWS)}")
+        self.kernel: Kernel = check_kernel(kernel)
+        if draw == "AMM" and self.kernel != "rbf":
+            raise ValueError(f"the draw AMM has closed forms for the kernel 'rbf' only, received {kernel!r}")
+        if draw == "AMM" and observation_spec is not None and observation_spec.body_frame:
+            raise ValueError(
+                "the draw AMM has closed forms for sines and cosines, not for vectors that turn with a heading: "
+                f"received body_frame={observation_spec.body_frame}; take the draw MM"
+            )
+        super().__init__(observation_size, action_size, observation_spec, dtype, device)
+        self.num_inducing, self.exact, self.max_iterations = num_inducing, exact, max_iterations
+        self.draw_kind, self.add_noise, self.update_within_episode = draw, add_noise, update_within_episode
+
+    def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
+        """Maximise the collapsed bound, then condition on all transitions.
+
+        Raises:
+            ValueError: there are no transitions.
+        """
+        normalisers, standardised = self._standardised(data)
+        start = self._start(standardised, normalisers, generator)
+        found = maximise_bound(
+            self.kernel, start, standardised, self.max_iterations, free_inducing_inputs=not self.exact
+        )
+        self._condition(found.model, normalisers, standardised)
+        return {
+            "bound": found.bound,
+            "evaluations": float(found.num_evaluations),
+            "noise_std": float(found.model.noise_variance.sqrt().mean()),
+            "kernel_std": float(found.model.layers[0].variance.sqrt()),
+        }
+
+    def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
+        """Condition on the grown data if ``update_within_episode``; otherwise nothing.
+
+        Raises:
+            RuntimeError: the model was not fitted.
+        """
+        model, normalisers, _ = self._require_fit("resample")
+        if self.update_within_episode:
+            x, y = self._encode(data)
+            standardised = Data(normalisers[0](x), normalisers[1](y))
+            if self.exact:  # the new transitions are inducing points too
+                model = model._replace(layers=(model.layers[0]._replace(inducing_inputs=standardised.x),))
+            self._condition(model, normalisers, standardised)
+        return {}
+
+    def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
+        """Particles for plans of ``horizon`` steps.
+
+        Raises:
+            RuntimeError: the model was not fitted.
+            ValueError: too few particles for "AMM".
+        """
+        model, normalisers, posterior = self._require_fit("draw")
+        noise = model.noise_variance if self.add_noise else torch.zeros_like(model.noise_variance)
+        if self.draw_kind == "AMM":
+            predictor = _predictor(model, posterior)
+            return MomentMatchingSampler(predictor, self.encoder, *normalisers, noise, num_particles, generator)
+
+        def predict(x: Tensor) -> Gaussian:
+            mean, variance = sparse_predict(self.kernel, model.layers[0], model.noise_variance, posterior, x.double())
+            return Gaussian(mean, variance + noise)
+
+        coordinates = Coordinates(self.encoder, *normalisers, self.dtype)
+        return GaussianSampler(predict, coordinates, generator, match_moments=self.draw_kind == "MM")
+
+    def state_dict(self) -> StateDict:
+        """Hyperparameters, normalisers and the posterior; empty before the first fit."""
+        if self._fitted is None:
+            return {}
+        model, normalisers, posterior = self._fitted
+        state: StateDict = {**model.layers[0]._asdict(), "log_noise": model.log_noise}
+        state |= normalisers_state(*normalisers)
+        return state | {f"posterior.{key}": value for key, value in posterior._asdict().items()}
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore `state_dict` of a model with the same settings.
+
+        Raises:
+            ValueError: an entry is missing or is not what these settings give it; the model stays as it was.
+        """
+        if not state:
+            self._fitted = None
+            return
+        sizes, device = (self.encoder.input_size, self.encoder.target_size), self.device
+        # With little data, or if exact, the number of inducing points is the data's.
+        received = state.get("inducing_inputs")
+        count = len(received) if isinstance(received, Tensor) and received.ndim == 2 else self.num_inducing
+        count = count if self.exact else min(count, self.num_inducing)
+        layer = take_layer(state, "", count, sizes[0], device)
+        model = DeepGP((layer,), take_tensor(state, "log_noise", (sizes[1],), device))
+        normalisers = (
+            take_normaliser(state, "inputs", sizes[0], device),
+            take_normaliser(state, "targets", sizes[1], device),
+        )
+        matrices = ((count, count), (count,), (count, sizes[1]))
+        names = (f"posterior.{name}" for name in SparsePosterior._fields)
+        posterior = SparsePosterior(*(take_tensor(state, *pair, device) for pair in zip(names, matrices, strict=True)))
+        self._fitted = _Fitted(model, normalisers, posterior)
+
+    def _start(self, data: Data, normalisers: tuple[Normaliser, Normaliser], generator: torch.Generator) -> DeepGP:
+        """Hyperparameters of the last training in the new standardisation, or fixed ones; fresh inducing inputs."""
+        num_data, size = data.x.shape
+        rows = torch.randperm(num_data, generator=generator, device=data.x.device)[: self.num_inducing]
+        inducing = data.x if self.exact else data.x[rows]
+        if self._fitted is None:
+            layer = Layer(inducing, data.x.new_full((size,), 0.5 * math.log(size)), data.x.new_zeros(()))
+            return DeepGP((layer,), data.y.new_full((data.y.shape[1],), math.log(NOISE_VARIANCE)))
+        last = self._fitted
+        outputs = data.y.new_zeros(last.model.num_whitened())  # of the inducing outputs nothing is carried over
+        model, _ = restandardise(last.model, outputs, last.normalisers, normalisers)
+        return model._replace(layers=(model.layers[0]._replace(inducing_inputs=inducing),))
+
+    def _condition(self, model: DeepGP, normalisers: tuple[Normaliser, Normaliser], data: Data) -> None:
+        posterior = sparse_posterior(self.kernel, model.layers[0], model.noise_variance, *data)
+        self._fitted = _Fitted(model, normalisers, posterior)
+
+
+def _predictor(model: DeepGP, posterior: SparsePosterior) -> Predictor:
+    """The same predictions, in the form of which the moments are known."""
+    layer, basis = model.layers[0], posterior.basis
+    removed = shrinkage(posterior, model.noise_variance).mT.unsqueeze(-1)
+    return Predictor(
+        layer.inducing_inputs,
+        layer.lengthscale,
+        layer.variance,
+        basis.mT @ posterior.mean,
+        basis.mT @ (removed * basis),
+    )

@@ -1,0 +1,211 @@
+"""Compiled rollouts against the same functions evaluated step by step with PyTorch, in single and double precision."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from gym_dgpmpc.data.encoding import Encoder
+from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.dynamics.coordinates import Coordinates
+from gym_dgpmpc.dynamics.deep_gp.draws import CompiledPathwiseSampler, PathwiseSampler, Posterior
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics, compiled_rollout
+from gym_dgpmpc.gp.deep_gp import factorise_all
+from gym_dgpmpc.gp.kernels import KERNELS
+from gym_dgpmpc.planning.rollout import rollout
+from gym_dgpmpc.types import ObservationSpec, TrajectorySampler, Transitions
+from tests.oracles.models import make_model, normal, seeded
+
+HORIZON, PARTICLES = 6, 3
+SPECS = [
+    ObservationSpec(),
+    ObservationSpec(angles=(1,)),
+    ObservationSpec(angles=(1,), absolute=(0, 2), not_inputs=(0,), constant=(2,)),
+    ObservationSpec(angles=(1,), body_frame=((1, 2, 0),)),
+    ObservationSpec(absolute=(0, 2), not_inputs=(0, 1, 2), body_frame=((1, 0, 2),)),
+    ObservationSpec(constant=(0, 1), body_frame=((2, 0, 1),)),
+]
+
+pytestmark = pytest.mark.skipif(not compiled_rollout.is_available(), reason="no C++ compiler works here")
+
+
+class Draw:
+    """The same functions, drawn from the same generator, as compiled code and as PyTorch in two precisions."""
+
+    def __init__(self, kernel, num_layers, spec=SPECS[1], refresh="step", num_inducing=13, num_features=21):
+        generator = seeded(3)
+        encoder = Encoder(3, 2, spec)
+        # Small steps: the rounding of one step is not to be amplified much by the next ones.
+        inputs, targets = (
+            Normaliser(0.1 * normal(generator, size), 0.8 + 0.1 * normal(generator, size).square())
+            for size in (encoder.input_size, encoder.target_size)
+        )
+        model = make_model(num_layers, encoder.input_size, encoder.target_size, num_inducing, generator)
+        whitened = model.split(normal(generator, PARTICLES, model.num_whitened()))
+        posterior = Posterior(kernel, model, factorise_all(kernel, model), whitened)
+
+        def sampler(dtype):
+            coordinates = Coordinates(encoder, inputs, targets, dtype)
+            return PathwiseSampler(posterior, coordinates, HORIZON, num_features, refresh, dtype, seeded())
+
+        single = Coordinates(encoder, inputs, targets, torch.float32)
+        self.compiled = CompiledPathwiseSampler(posterior, single, HORIZON, num_features, refresh, seeded())
+        self.single, self.double = sampler(torch.float32), sampler(torch.float64)
+        self.observation = normal(generator, 3).float()
+        self.generator = generator
+
+    def actions(self, num_candidates):
+        return normal(self.generator, num_candidates, HORIZON, 2).float()
+
+
+def errors(draw, actions):
+    """Largest error of compiled and of PyTorch's single precision after one step, against double precision."""
+    exact = rollout(draw.double, draw.observation.double(), actions.double(), PARTICLES)
+    found = draw.compiled.trajectories(draw.observation, actions)
+    assert found.shape == exact.shape
+    assert torch.equal(found[0], draw.observation.expand_as(found[0]))
+    by_torch = rollout(draw.single, draw.observation, actions, PARTICLES)
+    # Each compiled step from the state that it reached itself: how chaotic the functions are plays no part.
+    stepped = torch.stack([draw.double(found[t].double(), actions[:, t].double(), t) for t in range(HORIZON)])
+    return (found[1:] - stepped).abs().max(), (by_torch[1] - exact[1]).abs().max()
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("num_layers", [1, 3])
+@pytest.mark.parametrize("spec", SPECS)
+@pytest.mark.parametrize("refresh", ["step", "plan"])
+def test_is_as_exact_as_pytorch_in_single_precision(kernel, num_layers, spec, refresh):
+    draw = Draw(kernel, num_layers, spec, refresh)
+    compiled, by_torch = errors(draw, draw.actions(40))
+    # Rounding differs, its size does not: the state's magnitude times that of the weights, in units of 6e-8.
+    assert compiled < max(10 * by_torch, 1e-5)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_far_from_the_inducing_inputs_and_on_them(kernel):
+    """Vanishing kernels, many turns of the features and angles, and distances of exactly zero."""
+    draw = Draw(kernel, 1, ObservationSpec())
+    scale = draw.single.layers[0].inverse_lengthscale
+    centre = draw.single.layers[0].centres[:, 0] / scale  # some multiple of the first inducing input
+    for observation in (torch.full((3,), 40.0), torch.zeros(3), centre[:3]):
+        draw.observation = observation
+        compiled, by_torch = errors(draw, draw.actions(5))
+        # cos of a phase phi errs by the rounding of phi.
+        assert compiled < max(10 * by_torch, 1e-6 * observation.abs().max(), 1e-5)
+
+
+def test_large_angles_keep_their_digits():
+    draw = Draw("rbf", 1, SPECS[1])
+    draw.observation = torch.tensor([0.1, 1000.0, 0.2])
+    compiled, _ = errors(draw, draw.actions(5))
+    assert compiled < 1000 * 2e-7 * 5  # an angle of 1000 is itself rounded to 3e-5
+
+
+@pytest.mark.parametrize("num_candidates", [1, 31, 32, 33, 100])
+def test_any_number_of_candidates_and_threads(num_candidates):
+    draw = Draw("matern32", 2)
+    actions = draw.actions(num_candidates)
+    threads = torch.get_num_threads()
+    try:
+        found = []
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            found.append(draw.compiled.trajectories(draw.observation, actions))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], found[2])
+    alone = torch.cat([draw.compiled.trajectories(draw.observation, a[None]) for a in actions], dim=2)
+    assert torch.equal(found[0], alone), "a candidate's trajectory depends on its neighbours"
+
+
+FORKED = """
+import multiprocessing, torch
+from tests.dynamics.deep_gp.test_compiled_rollout import Draw
+torch.set_num_threads(2)
+draw = Draw("rbf", 1)
+actions = draw.actions(100)
+expected = draw.compiled.trajectories(draw.observation, actions)
+def same(_): return torch.equal(draw.compiled.trajectories(draw.observation, actions), expected)
+with multiprocessing.get_context("fork").Pool(1) as pool:
+    print(pool.map_async(same, [0]).get(timeout=20))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_child_has_threads_of_its_own():
+    """The parent's are not in it, and it would wait for them for ever."""
+    root = Path(__file__).parents[3]
+    done = subprocess.run(
+        [sys.executable, "-c", FORKED], cwd=root, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.stdout == "[True]\n", done.stderr
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e30])
+def test_what_is_not_finite_never_becomes_finite(kernel, value):
+    draw = Draw(kernel, 2, ObservationSpec())
+    actions = draw.actions(4)
+    actions[2, 3, 0] = value
+    states = draw.compiled.trajectories(draw.observation, actions)
+    assert states[:4, :, 2].isfinite().all()
+    if abs(value) != 1e30:  # an action that is only large has a cosine like any other
+        assert states[4:, :, 2].isnan().all()
+    others = [0, 1, 3]
+    assert states[:, :, others].isfinite().all()
+
+
+def test_the_argument_may_be_a_view_of_another_precision():
+    draw = Draw("matern52", 1)
+    actions = draw.actions(8)
+    expected = draw.compiled.trajectories(draw.observation, actions)
+    strided = torch.stack([actions, actions], dim=-1).double()[..., 0]
+    assert torch.equal(draw.compiled.trajectories(draw.observation.double(), strided), expected)
+
+
+@pytest.mark.parametrize(
+    ("observation_size", "action_size", "horizon", "message"),
+    [
+        (2, 2, HORIZON, r"observation must have the shape \(3,\), got \(2,\)"),
+        (3, 1, HORIZON, rf"actions must have the shape \[K, H, 2\], got \(4, {HORIZON}, 1\)"),
+        (3, 2, HORIZON + 1, f"plans of at most {HORIZON} steps, got actions for {HORIZON + 1}"),
+    ],
+)
+def test_sizes_that_are_not_the_draws_are_refused(observation_size, action_size, horizon, message):
+    """The compiled code would read beyond its arrays."""
+    sampler = Draw("rbf", 1).compiled
+    with pytest.raises(ValueError, match=message):
+        sampler.trajectories(torch.zeros(observation_size), torch.zeros(4, horizon, action_size))
+
+
+def test_functions_for_a_whole_plan_serve_one_of_any_length():
+    sampler = Draw("rbf", 1, refresh="plan").compiled
+    assert sampler.trajectories(torch.zeros(3), torch.zeros(4, 2 * HORIZON, 2)).isfinite().all()
+
+
+@pytest.mark.parametrize("refresh", ["step", "plan"])
+def test_the_model_draws_compiled_worlds_and_plans_alike_without(refresh):
+    generator = seeded()
+    observation, action = normal(generator, 60, 3).float(), normal(generator, 60, 2).float()
+    data = Transitions(observation, action, observation + 0.1 * observation.flip(1).tanh())
+    results = []
+    for compile in (True, False):
+        model = DeepGPDynamics(
+            3, 2, num_inducing=20, num_features=32, first_iterations=20, num_samples=5, refresh=refresh, compile=compile
+        )
+        model.fit(data, seeded(1))
+        world = model.draw(PARTICLES, HORIZON, seeded(2))
+        assert isinstance(world, TrajectorySampler) == compile
+        results.append(rollout(world, observation[0], normal(seeded(4), 50, HORIZON, 2).float(), PARTICLES))
+    torch.testing.assert_close(results[0], results[1], rtol=1e-3, atol=1e-3)
+
+
+def test_double_precision_is_rolled_out_by_pytorch():
+    model = DeepGPDynamics(3, 2, num_inducing=5, first_iterations=2, num_samples=2, dtype=torch.float64)
+    observation = normal(seeded(), 10, 3).float()
+    model.fit(Transitions(observation, observation[:, :2], observation), seeded())
+    assert not isinstance(model.draw(2, 3, seeded()), TrajectorySampler)

@@ -1,0 +1,135 @@
+"""Building the compiled code: where it is kept, and that the package works without it."""
+
+import functools
+import os
+import stat
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+
+from gym_dgpmpc.dynamics.deep_gp import compiled_rollout, compiler
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
+from gym_dgpmpc.types import TrajectorySampler, Transitions
+from tests.oracles.models import normal, seeded
+
+needs_compiler = pytest.mark.skipif(not compiled_rollout.is_available(), reason="no C++ compiler works here")
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch, tmp_path):
+    """A cache of its own for every test, and no memory of what was loaded before."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for remembered in (compiler.load, compiled_rollout._library):
+        remembered.cache_clear()
+    yield
+    for remembered in (compiler.load, compiled_rollout._library):
+        remembered.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("command", "complaint"),
+    [
+        ("no-such-compiler", "no C\\+\\+ compiler was found \\(looked for no-such-compiler\\)"),
+        ("false", "false failed"),
+    ],
+)
+def test_without_a_compiler_one_warning_and_the_same_worlds(monkeypatch, command, complaint):
+    monkeypatch.setenv("CXX", command)
+    model = DeepGPDynamics(3, 2, num_inducing=5, first_iterations=2, num_samples=2)
+    observation = normal(seeded(), 10, 3).float()
+    model.fit(Transitions(observation, observation[:, :2], observation), seeded())
+    with pytest.warns(UserWarning, match=complaint):
+        world = model.draw(2, 3, seeded())
+    assert not isinstance(world, TrajectorySampler)
+    assert world(observation.expand(2, -1, -1).clone(), observation[:, :2], 0).isfinite().all()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.draw(2, 3, seeded())
+
+
+def test_who_does_not_want_it_is_not_warned(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    model = DeepGPDynamics(3, 2, num_inducing=5, first_iterations=2, num_samples=2, compile=False)
+    observation = normal(seeded(), 10, 3).float()
+    model.fit(Transitions(observation, observation[:, :2], observation), seeded())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.draw(2, 3, seeded())
+
+
+@needs_compiler
+def test_is_built_once(tmp_path, monkeypatch):
+    assert compiler.load("rollout") is not None
+    (library,) = (tmp_path / "gym_dgpmpc").iterdir()
+    built = library.stat().st_mtime_ns
+    compiler.load.cache_clear()
+    assert compiler.load("rollout") is not None
+    (again,) = (tmp_path / "gym_dgpmpc").iterdir()
+    assert (again, again.stat().st_mtime_ns) == (library, built)
+    # Other flags, another library: what was built for another machine is never loaded.
+    monkeypatch.setattr(compiler, "FLAGS", (*compiler.FLAGS, "-DOTHER"))
+    compiler.load.cache_clear()
+    assert compiler.load("rollout") is not None
+    assert len(list((tmp_path / "gym_dgpmpc").iterdir())) == 2
+
+
+@needs_compiler
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="this system has no such permissions")
+def test_a_cache_that_others_can_write_to_is_not_used(tmp_path):
+    folder = compiler.cache_folder()
+    folder.chmod(0o777)
+    with pytest.warns(UserWarning, match="can be written to by other users"):
+        assert compiler.load("rollout") is None
+    folder.chmod(0o700)
+    assert stat.S_IMODE(compiler.cache_folder().stat().st_mode) == 0o700
+
+
+@needs_compiler
+def test_without_a_home_it_is_built_elsewhere_and_removed_in_the_end(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    program = """
+import os
+from gym_dgpmpc.dynamics.deep_gp import compiler
+assert compiler.load("rollout") is not None
+print(len(os.listdir(os.environ["TMPDIR"])))
+"""
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "file"), "TMPDIR": str(temporary)}
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment,
+        cwd=Path(__file__).parents[3],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.stdout == "1\n", done.stderr
+    assert not list(temporary.iterdir())
+
+
+def test_memory_that_cannot_be_had_is_an_error(monkeypatch):
+    """The compiled code says by its result that it could not allocate; nothing is then returned as if computed."""
+
+    class Library:
+        def units(self):
+            return 4
+
+        def points(self):
+            return 8
+
+        def rollout(self, *_):
+            return 1
+
+    monkeypatch.setattr(compiled_rollout, "_library", functools.cache(Library))
+    model = DeepGPDynamics(3, 2, num_inducing=5, first_iterations=2, num_samples=2, compile=True)
+    observation = normal(seeded(), 10, 3).float()
+    model.fit(Transitions(observation, observation[:, :2], observation), seeded())
+    world = model.draw(2, 3, seeded())
+    with pytest.raises(MemoryError, match="scratch space"):
+        world.trajectories(observation[0], torch.zeros(4, 3, 2))
