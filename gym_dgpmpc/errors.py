@@ -6,7 +6,7 @@ class DGPMPCError(Exception):
 
 
 class PlanningError(DGPMPCError, RuntimeError):
-    """No candidate action sequence had a finite score."""
+    """No candidate action sequence had a finite score, or a planner returned what is no plan of its own."""
 
 
 class EnvironmentDataError(DGPMPCError, ValueError):

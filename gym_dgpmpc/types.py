@@ -12,7 +12,8 @@ P particles, H horizon.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import index
-from typing import NamedTuple, Protocol, runtime_checkable
+from types import MappingProxyType
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -139,37 +140,78 @@ Objective = Callable[[Float[Tensor, "K H A"]], Float[Tensor, "K"]]
 """Scores K candidate action sequences; higher is better; a score that is not finite never wins."""
 
 
-class Plan(NamedTuple):
-    """A diagonal Gaussian over action sequences."""
+@runtime_checkable
+class Plan(Protocol):
+    """What a planner carries from one plan to the next: a NamedTuple of tensors of fixed shapes and dtypes.
 
-    mean: Float[Tensor, "H A"]
-    std: Float[Tensor, "H A"]
+    The rest of the package reads `actions` alone. Everything else (a standard deviation, elites, a policy's weights)
+    is the planner's own business: it is stacked, saved and handed back as it is.
+    """
+
+    @property
+    def actions(self) -> Float[Tensor, "H A"]:
+        """The sequence to perform."""
+        ...
+
+    def _asdict(self) -> dict[str, Any]: ...
 
 
 class PlanInfo(NamedTuple):
-    """What a plan found. ``expected_return`` is the mean score of the elites of the last iteration; NaN without one."""
+    """What a plan found.
+
+    Attributes:
+        expected_return: what the plan is expected to earn over its horizon; NaN if nothing was scored.
+        num_nonfinite: candidates that were left out because their score was not finite.
+        metrics: further numbers, finite or NaN, logged as ``planner/<name>``: the mean over an episode's plans.
+    """
 
     expected_return: float
-    num_nonfinite: int
-    num_iterations: int
+    num_nonfinite: int = 0
+    metrics: Mapping[str, float] = MappingProxyType({})
+
+
+AnyPlan = TypeVar("AnyPlan", bound=Plan)
+"""The type of one planner's plans."""
 
 
 @runtime_checkable
-class Planner(Protocol):
-    """Improves a plan under an objective; knows neither the model nor the environment."""
+class Planner(Protocol[AnyPlan]):
+    """Improves a plan under an objective; knows neither the model nor the environment.
 
-    def initial_plan(self) -> Plan: ...
+    A planner is made by ``factory(action_low, action_high, *, horizon=..., <its settings>)``: bounds as finite vectors
+    [A], whose dtype and device are those of the plans; keyword-only arguments with defaults are its settings. What all
+    planners promise is tested by ``tests/planning/test_planner_contract.py``.
+    """
+
+    def initial_plan(self) -> AnyPlan:
+        """Where the first plan of an episode starts from."""
+        ...
 
     def plan(
-        self, objective: Objective, plan: Plan, generator: torch.Generator, deadline: float | None = None
-    ) -> tuple[Plan, PlanInfo]:
-        """Optimise from ``plan``; the result's mean lies within the action bounds.
+        self, objective: Objective, plan: AnyPlan, generator: torch.Generator, deadline: float | None = None
+    ) -> tuple[AnyPlan, PlanInfo]:
+        """Optimise from ``plan``; the result's actions lie within the bounds.
 
         Args:
-            deadline: a time of `time.perf_counter` by which to return the best plan so far, or None.
+            objective: what to maximise.
+            plan: `initial_plan`, or what `shift` returned; it is not changed.
+            generator: for everything random.
+            deadline: a time of `time.perf_counter` by which to return the best plan so far, or None. Once it has
+                passed nothing is scored any more, and the result is ``plan`` with its actions within the bounds.
+
+        Raises:
+            PlanningError: no candidate had a finite score.
         """
         ...
 
-    def shift(self, plan: Plan, num_actions: int) -> Plan:
-        """The warm start after ``num_actions`` of the plan have been performed."""
+    def shift(self, plan: AnyPlan, num_actions: int) -> AnyPlan:
+        """The warm start after ``num_actions`` of the plan have been performed: its other actions come first.
+
+        Raises:
+            ValueError: the plan has fewer than ``num_actions`` actions.
+        """
         ...
+
+
+PlannerFactory = Callable[..., Planner]
+"""(action_low, action_high, *, horizon=..., settings) -> a planner; see `Planner`."""

@@ -3,7 +3,6 @@
 `mpc.py` puts these steps together to the algorithm that learns.
 """
 
-import time
 from contextlib import suppress
 from typing import Any
 
@@ -89,14 +88,13 @@ class ActingAgent(PlanningAgent):
         """
         task, worlds, actions = self.modelled.task(self.task), self.planning.worlds(self.generators.planning), []
         for running, observation in zip(self._running, observations, strict=True):
-            started, late = time.perf_counter(), self.planning.num_late
-            action, running.carried, info = self.planning.plan(
+            acted = self.planning.act(
                 task, self.modelled.start(observation), running.carried, self.generators.planning, worlds
             )
-            if info is not None:
-                seconds = time.perf_counter() - started
-                running.record.add_plan(info, seconds, late=self.planning.num_late > late)
-            actions.append(action)
+            running.carried = acted.carried
+            if acted.info is not None:
+                running.record.add_plan(acted.info, acted.seconds, late=acted.late)
+            actions.append(acted.action)
         return np.stack(actions)
 
     def _perform_and_append(

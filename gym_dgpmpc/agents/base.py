@@ -17,7 +17,7 @@ from gym_dgpmpc.checkpoints.collect import collect
 from gym_dgpmpc.checkpoints.format import CheckpointPath, write_checkpoint
 from gym_dgpmpc.checkpoints.restore import load_agent
 from gym_dgpmpc.errors import EnvironmentDataError
-from gym_dgpmpc.planning.plan_state import PlanState, PolicyState, pack, unpack
+from gym_dgpmpc.planning.plan_state import PackedPlans, PlanState, pack, unpack
 from gym_dgpmpc.randomness import observation_generator
 from gym_dgpmpc.tasks.dict_observations import check_parts, flatten, layout
 from gym_dgpmpc.tasks.task import (
@@ -33,10 +33,10 @@ class PlanningAgent(ComposedAgent):
     def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],
-        state: PolicyState | None = None,
+        state: PackedPlans | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-    ) -> tuple[np.ndarray, PolicyState]:
+    ) -> tuple[np.ndarray, PackedPlans]:
         """Plan, and return the action and the plan to pass to the next call.
 
         Leaves learning untouched: nothing that training draws from or trains is moved. With a ``time_budget`` the plan
@@ -52,9 +52,9 @@ class PlanningAgent(ComposedAgent):
                 generator that moves on with every call.
 
         Returns:
-            The action (or n of them), in the action space's shape and dtype, and the state: mean [n, H, A], standard
-            deviation [n, H, A] and age [n] of the plans. An agent that has not learned yet warns once and returns the
-            middle of the action range, or uniformly random actions unless ``deterministic``.
+            The action (or n of them), in the action space's shape and dtype, and the state: the plans' fields (of a
+            `CEM` mean and standard deviation, [n, H, A]) and their ages [n]. An agent that has not learned yet warns
+            once and returns the middle of the action range, or uniformly random actions unless ``deterministic``.
 
         Raises:
             ValueError: observation or state has the wrong shape, or a dict other parts than the environment's.
@@ -86,12 +86,11 @@ class PlanningAgent(ComposedAgent):
     def _planned(
         self, observation: np.ndarray, before: PlanState, generator: torch.Generator
     ) -> tuple[np.ndarray, PlanState]:
-        late = self.planning.num_late
         task, start = self.modelled.task(self.task), self.modelled.start(observation)
-        action, after, _ = self.planning.plan(task, start, before, generator)
-        if self.planning.num_late > late:
+        acted = self.planning.act(task, start, before, generator)
+        if acted.late:
             self._warn_once(f"a plan took longer than the time_budget of {self.time_budget} s: see num_late_plans")
-        return action, after
+        return acted.action, acted.carried
 
     def dump_logs(self) -> None:
         """Write what was recorded since the last time, with running means and speed."""

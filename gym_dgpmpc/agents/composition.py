@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import UnknownRewardError
-from gym_dgpmpc.planning.controller import PlanningPolicy
+from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.randomness import fresh_seed, split_seed
 from gym_dgpmpc.tasks.dict_observations import FlatDict
 from gym_dgpmpc.tasks.first_batch import REWARD_SIGNATURE
@@ -139,14 +139,14 @@ class ComposedAgent(BaseAlgorithm):
         self.new_model(reward=self._task is not None and self._task.reward_fn is None)
         if not hasattr(self, "dynamics") or not hasattr(self, "planner"):
             raise ValueError("an MPCAgent is made of a dynamics model and a planner: pass dynamics=... and planner=...")
-        self.planning = PlanningPolicy(
+        self.planning = Controller(
             self.dynamics,
             self.planner,
             self.action_space,
-            self.num_particles,
-            self.actions_per_plan,
-            self.device,
-            self.time_budget,
+            num_particles=self.num_particles,
+            actions_per_plan=self.actions_per_plan,
+            time_budget=self.time_budget,
+            device=self.device,
         )
         self._warned: set[str] = set()
 

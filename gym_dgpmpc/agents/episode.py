@@ -8,6 +8,12 @@ from torch import Tensor
 
 from gym_dgpmpc.types import PlanInfo
 
+METRIC = "metric."
+"""Before the names of the planner's own metrics in `EpisodeRecord.state_dict`."""
+
+COMMON = ("expected_return", "predicted_reward_per_step", "obtained_reward_per_step", "num_nonfinite", "num_late")
+"""What is logged as ``planner/<name>`` whatever the planner is; its own metrics have other names."""
+
 
 class EpisodeRecord:
     """Gathers one episode while it runs.
@@ -29,7 +35,14 @@ class EpisodeRecord:
         self.has_terminated = False
 
     def add_plan(self, info: PlanInfo, seconds: float, *, late: bool = False) -> None:
-        """A plan made before the step whose reward is added next."""
+        """A plan made before the step whose reward is added next.
+
+        Raises:
+            ValueError: a metric of the planner has a name that is logged of every planner.
+        """
+        taken = [name for name in info.metrics if name in COMMON]
+        if taken:
+            raise ValueError(f"a planner's metrics must have other names than {COMMON}, got {taken}")
         self.plans.append(info)
         self.plan_steps.append(len(self.rewards))
         self.plan_seconds.append(seconds)
@@ -76,10 +89,19 @@ class EpisodeRecord:
             metrics["planner/obtained_reward_per_step"] = obtained
             metrics["planner/num_nonfinite"] = sum(info.num_nonfinite for info in self.plans)
             metrics["planner/num_late"] = self.num_late
-            metrics["planner/num_iterations"] = float(np.mean([info.num_iterations for info in self.plans]))
+            metrics |= {f"planner/{name}": value for name, value in self._means_of_metrics().items()}
             metrics["time/plan_ms"] = 1e3 * float(np.mean(self.plan_seconds))
             metrics["time/plan_ms_p95"] = 1e3 * float(np.quantile(self.plan_seconds, 0.95))
         return metrics
+
+    def _means_of_metrics(self) -> dict[str, float]:
+        """Of each metric of the planner, the mean over the plans that have it; NaN is not one."""
+        known: dict[str, list[float]] = {}
+        for info in self.plans:
+            for name, value in info.metrics.items():
+                if not np.isnan(value):
+                    known.setdefault(name, []).append(value)
+        return {name: float(np.mean(values)) for name, values in known.items()}
 
     def line(self, num_timesteps: int) -> str:
         """The episode on one line, for a person."""
@@ -99,12 +121,24 @@ class EpisodeRecord:
         """Everything but the number, which is counted elsewhere."""
         return {
             "rewards": torch.tensor(self.rewards, dtype=torch.float64),
-            "plans": torch.tensor(self.plans, dtype=torch.float64).reshape(-1, len(PlanInfo._fields)),
+            "expected_return": torch.tensor([info.expected_return for info in self.plans], dtype=torch.float64),
+            "num_nonfinite": torch.tensor([info.num_nonfinite for info in self.plans], dtype=torch.int64),
+            **self._metric_columns(),
             "plan_steps": torch.tensor(self.plan_steps, dtype=torch.int64),
             "plan_seconds": torch.tensor(self.plan_seconds, dtype=torch.float64),
             "num_late": torch.tensor(self.num_late),
             "has_terminated": torch.tensor(self.has_terminated),
             "seconds": torch.tensor(self.seconds, dtype=torch.float64),
+        }
+
+    def _metric_columns(self) -> dict[str, Tensor]:
+        """Each metric of the planner, one number per plan; NaN where a plan has none of that name."""
+        names = sorted({name for info in self.plans for name in info.metrics})
+        return {
+            METRIC + name: torch.tensor(
+                [info.metrics.get(name, float("nan")) for info in self.plans], dtype=torch.float64
+            )
+            for name in names
         }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -113,14 +147,30 @@ class EpisodeRecord:
         Raises:
             KeyError, TypeError, ValueError: the state is not one.
         """
-        plans = state["plans"].tolist()
-        counts = {len(plans), *state["plan_steps"].shape, *state["plan_seconds"].shape}
+        columns = _plan_columns(state)
+        counts = {size for column in columns.values() for size in column.shape}
+        counts |= {*state["plan_steps"].shape, *state["plan_seconds"].shape}
         if len(counts) != 1 or state["rewards"].ndim != 1:
             raise ValueError(f"an episode's record has plans of different counts: {counts}")
         self.rewards = state["rewards"].tolist()
-        self.plans = [PlanInfo(value, int(nonfinite), int(iterations)) for value, nonfinite, iterations in plans]
+        returns, nonfinite = columns.pop("expected_return").tolist(), columns.pop("num_nonfinite").tolist()
+        metrics = {name.removeprefix(METRIC): column.tolist() for name, column in columns.items()}
+        self.plans = [
+            PlanInfo(expected, int(count), {name: values[i] for name, values in metrics.items()})
+            for i, (expected, count) in enumerate(zip(returns, nonfinite, strict=True))
+        ]
         self.plan_steps = [int(step) for step in state["plan_steps"].tolist()]
         self.plan_seconds = state["plan_seconds"].tolist()
         self.num_late = int(state["num_late"])
         self.has_terminated = bool(state.get("has_terminated", False))  # older files do not say
         self._started = time.perf_counter() - float(state["seconds"])
+
+
+def _plan_columns(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """What the plans found, one column [n] per name of `EpisodeRecord.state_dict`."""
+    if "plans" in state:  # one table, in files of the schemas 2 to 4
+        expected_return, num_nonfinite, num_iterations = state["plans"].T
+        old = {"expected_return": expected_return, "num_nonfinite": num_nonfinite}
+        return old | {f"{METRIC}num_iterations": num_iterations}
+    names = ["expected_return", "num_nonfinite", *(name for name in state if name.startswith(METRIC))]
+    return {name: state[name] for name in names}

@@ -10,8 +10,8 @@ import torch
 from stable_baselines3.common.type_aliases import GymEnv
 
 from gym_dgpmpc.agents.mpc import MPCAgent
-from gym_dgpmpc.agents.parts import cem_planner
 from gym_dgpmpc.dynamics.sparse_gp.model import GPDraw, SparseGPDynamics
+from gym_dgpmpc.planning import make_planner
 from gym_dgpmpc.tasks.task import LEARNED, Learned, flat_size
 from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
 
@@ -131,7 +131,8 @@ class GPMPCAgent(MPCAgent):
 
     def _setup_model(self) -> None:
         """Build the planner for the environment's spaces; the model follows when it is known what it has to predict."""
-        self.planner = cem_planner(
+        self.planner = make_planner(
+            "cem",
             self.action_space,
             self.device,
             horizon=self.horizon,

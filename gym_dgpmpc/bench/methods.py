@@ -11,17 +11,16 @@ from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
 
 from gym_dgpmpc.agents import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent, presets
-from gym_dgpmpc.agents.parts import cem_planner
 from gym_dgpmpc.bench.tasks import Task
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.gp.kernels import KERNELS
+from gym_dgpmpc.planning import make_planner
 
 NO_SETTINGS = {
     "env",
@@ -138,9 +137,9 @@ def true_dynamics_agent(
         ValueError: the environment's simulator cannot be used; see `Simulator`.
     """
     assert isinstance(env.action_space, spaces.Box)
-    planner = cem_planner(
+    planner = make_planner(
+        "cem",
         env.action_space,
-        torch.device("cpu"),
         horizon=horizon,
         num_candidates=num_candidates,
         num_elites=num_elites,

@@ -21,7 +21,7 @@ from gym_dgpmpc.agents.recent_episodes import recent_episodes
 from gym_dgpmpc.checkpoints.format import Checkpoint
 from gym_dgpmpc.checkpoints.saved import saved_arguments
 from gym_dgpmpc.errors import CheckpointError, CheckpointWriteError
-from gym_dgpmpc.planning.plan_state import pack
+from gym_dgpmpc.planning.plan_state import plans_to_tensors
 from gym_dgpmpc.tasks.dict_observations import layout
 from gym_dgpmpc.tasks.replay import describe_start, options_to_reset
 from gym_dgpmpc.tasks.task import LEARNED, environment_id
@@ -31,7 +31,6 @@ PACKAGES = ("gym_dgpmpc", "gymnasium", "numpy", "stable_baselines3", "torch")
 COUNTERS = ("num_timesteps", "num_fitted", "_episode_num")
 ABOUT_ENVIRONMENT = ("environment", "observation_parts", "reset_options")
 SPACES, BOUNDS = ("observation_space", "action_space"), ("low", "high")
-PLANS = ("plan.mean", "plan.std", "plan.age")
 
 
 def collect(agent: Any, *, gives_up: bool = False) -> Checkpoint:
@@ -116,8 +115,7 @@ def _bounds(agent: Any) -> dict[str, Tensor]:
 
 def _running_state(agent: Any) -> dict[str, Tensor]:
     """Plans and records of the running episodes."""
-    carried = pack([episode.carried for episode in agent._running])
-    plans = dict(zip(PLANS, map(torch.from_numpy, carried), strict=True))
+    plans = plans_to_tensors([episode.carried for episode in agent._running])
     return plans | {
         f"record.{index}.{name}": value
         for index, episode in enumerate(agent._running)

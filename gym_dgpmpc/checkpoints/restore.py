@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from gym_dgpmpc.agents.recent_episodes import restore_recent_episodes
-from gym_dgpmpc.checkpoints.collect import ABOUT_ENVIRONMENT, COUNTERS, PLANS
+from gym_dgpmpc.checkpoints.collect import ABOUT_ENVIRONMENT, COUNTERS
 from gym_dgpmpc.checkpoints.format import Checkpoint, CheckpointPath, read_checkpoint
 from gym_dgpmpc.checkpoints.saved import (
     MAX_COUNT,
@@ -25,7 +25,7 @@ from gym_dgpmpc.checkpoints.saved import (
     saved_spaces,
 )
 from gym_dgpmpc.errors import CheckpointError, DGPMPCError, ReliabilityWarning, UnknownRewardError
-from gym_dgpmpc.planning.plan_state import PlanState, unpack
+from gym_dgpmpc.planning.plan_state import PlanState, plans_from_tensors
 from gym_dgpmpc.randomness import derive_seed, split_seed
 from gym_dgpmpc.tasks.dict_observations import layout
 from gym_dgpmpc.tasks.replay import set_options
@@ -212,12 +212,12 @@ def _restore_running(agent: Any, checkpoint: Checkpoint, own: dict[str, Any]) ->
 
 def _saved_plans(agent: Any, checkpoint: Checkpoint, own: dict[str, Any]) -> list[PlanState]:
     """The plan of each saved episode; a cold one where the agent looks ahead otherwise, or replans sooner."""
-    carried, cold = tuple(own[name].numpy() for name in PLANS), agent.planning.cold
-    count = len(saved_running(checkpoint))
-    if carried[0].shape[1] != agent.planning.horizon:
+    cold, count = agent.planning.cold, len(saved_running(checkpoint))
+    fields = {f"plan.{name}": value.shape for name, value in cold.plan._asdict().items()}
+    if any(own[name].shape[1:] != shape for name, shape in fields.items()):
         return [cold] * count
     actions_per_plan = checkpoint.config["arguments"].get("actions_per_plan", agent.actions_per_plan)
-    plans = unpack(carried, cold, count, actions_per_plan)
+    plans = plans_from_tensors(own, cold, count, actions_per_plan)
     return [plan if plan.age < agent.actions_per_plan else cold for plan in plans]
 
 

@@ -1,6 +1,16 @@
 """Planning: a drawn world and a reward become an objective, and a planner maximises it over action sequences."""
 
 from gym_dgpmpc.planning.cem import CEM
+from gym_dgpmpc.planning.registry import PLANNERS, make_planner, planner_factory, register_planner
 from gym_dgpmpc.planning.rollout import particle_returns, rollout, rollout_objective
 
-__all__ = ["CEM", "particle_returns", "rollout", "rollout_objective"]
+__all__ = [
+    "CEM",
+    "PLANNERS",
+    "make_planner",
+    "particle_returns",
+    "planner_factory",
+    "register_planner",
+    "rollout",
+    "rollout_objective",
+]

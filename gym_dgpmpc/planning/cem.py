@@ -6,6 +6,7 @@ truncation and the variance cap are in their published code rather than in the t
 
 import math
 import time
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import PlanningError
-from gym_dgpmpc.types import Objective, Plan, PlanInfo
+from gym_dgpmpc.types import Objective, PlanInfo
 
 TRUNCATION = 2.0  # candidates lie within this many standard deviations of the mean
 
@@ -49,6 +50,18 @@ def elite_shares(scores: Float[Tensor, " K"], num_elites: int) -> Float[Tensor, 
     return share / valid.sum().clamp(min=1)
 
 
+class GaussianPlan(NamedTuple):
+    """A diagonal Gaussian over action sequences."""
+
+    mean: Float[Tensor, "H A"]
+    std: Float[Tensor, "H A"]
+
+    @property
+    def actions(self) -> Float[Tensor, "H A"]:
+        """The mean."""
+        return self.mean
+
+
 class CEM:
     """Cross-entropy method: sample sequences, keep the best, fit a diagonal Gaussian to them, repeat.
 
@@ -56,10 +69,11 @@ class CEM:
     mean is carried from one control step to the next. The result is the mean, not the best sequence sampled.
 
     Args:
-        action_low, action_high: bounds of the action, [A], finite; their dtype and device are those of the plans.
+        action_low: lower bounds of the action, [A], finite; their dtype and device are those of the plans.
+        action_high: upper bounds, alike.
         horizon: H, the number of actions in a plan.
         num_candidates: K, the sequences sampled in each iteration.
-        num_elites: the best of them, to which the Gaussian is fitted.
+        num_elites: the best of them, to which the Gaussian is fitted; default: a tenth, and at least one.
         num_iterations: the most iterations a plan takes.
         smoothing: weight of the old mean and variance in the new ones, in [0, 1).
         min_std: stop once every action's standard deviation is below this fraction of its range. (PETS stops at the
@@ -72,20 +86,21 @@ class CEM:
 
     def __init__(
         self,
-        *,
         action_low: Float[Tensor, " A"],
         action_high: Float[Tensor, " A"],
-        horizon: int,
+        *,
+        horizon: int = 30,
         num_candidates: int = 300,
-        num_elites: int = 30,
+        num_elites: int | None = None,
         num_iterations: int = 5,
         smoothing: float = 0.1,
         min_std: float = 0.005,
     ):
         _check_bounds(action_low, action_high)
-        check_counts(
-            horizon=horizon, num_candidates=num_candidates, num_elites=num_elites, num_iterations=num_iterations
-        )
+        check_counts(horizon=horizon, num_candidates=num_candidates, num_iterations=num_iterations)
+        if num_elites is None:
+            num_elites = max(1, num_candidates // 10)
+        check_counts(num_elites=num_elites)
         if num_elites > num_candidates:
             raise ValueError(f"num_elites must not exceed num_candidates, got {num_elites} of {num_candidates}")
         if not 0.0 <= smoothing < 1.0:
@@ -101,11 +116,11 @@ class CEM:
         self.smoothing = smoothing
         self.min_std = min_std
 
-    def initial_plan(self) -> Plan:
+    def initial_plan(self) -> GaussianPlan:
         """The middle of the action range at every step, with the start's standard deviation."""
         return self._widened(self._midpoint(self.horizon))
 
-    def shift(self, plan: Plan, num_actions: int) -> Plan:
+    def shift(self, plan: GaussianPlan, num_actions: int) -> GaussianPlan:
         """Drop the first ``num_actions`` of the mean, fill its end with the midpoint and widen it again.
 
         Raises:
@@ -118,8 +133,8 @@ class CEM:
 
     @torch.no_grad()
     def plan(
-        self, objective: Objective, plan: Plan, generator: torch.Generator, deadline: float | None = None
-    ) -> tuple[Plan, PlanInfo]:
+        self, objective: Objective, plan: GaussianPlan, generator: torch.Generator, deadline: float | None = None
+    ) -> tuple[GaussianPlan, PlanInfo]:
         """Maximise ``objective`` from ``plan``.
 
         A score that is not finite counts as minus infinity and is never an elite; with fewer finite scores than
@@ -177,16 +192,16 @@ class CEM:
             slowest = max(slowest, now - before)
             if is_narrow:
                 break
-        plan = Plan(mean.clamp(low, high), variance.sqrt())
-        return plan, PlanInfo(expected_return, num_nonfinite, iterations_done)
+        plan = GaussianPlan(mean.clamp(low, high), variance.sqrt())
+        return plan, PlanInfo(expected_return, num_nonfinite, {"num_iterations": iterations_done})
 
     def _midpoint(self, length: int) -> Float[Tensor, "length A"]:
         return (self.action_low / 2 + self.action_high / 2).expand(length, -1).clone()
 
-    def _widened(self, mean: Float[Tensor, "H A"]) -> Plan:
-        return Plan(mean, ((self.action_high - self.action_low) / 4).expand_as(mean).clone())
+    def _widened(self, mean: Float[Tensor, "H A"]) -> GaussianPlan:
+        return GaussianPlan(mean, ((self.action_high - self.action_low) / 4).expand_as(mean).clone())
 
-    def _check_plan(self, plan: Plan) -> None:
+    def _check_plan(self, plan: GaussianPlan) -> None:
         expected = (self.horizon, self.action_low.shape[0])
         for name, value in plan._asdict().items():
             if value.shape != expected or value.dtype != self.action_low.dtype:

@@ -1,6 +1,7 @@
 """From an observation to an action: draw worlds from the model, plan in them, carry the plan on.
 
-Knows nothing of learning or of the environment; the agent asks it both while it learns and when it predicts.
+Owns the model, the planner and how they are used; knows nothing of learning or of the environment. The agent asks it
+both while it learns and when it predicts.
 """
 
 import math
@@ -8,6 +9,7 @@ import numbers
 import time
 from collections.abc import Callable
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,13 +18,34 @@ from gymnasium import spaces
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import PlanningError
 from gym_dgpmpc.planning.plan_state import PlanState
+from gym_dgpmpc.planning.registry import action_bounds
 from gym_dgpmpc.planning.rollout import rollout_objective
 from gym_dgpmpc.tasks.task import Task
-from gym_dgpmpc.types import DynamicsModel, PlanInfo, Planner, TransitionSampler
+from gym_dgpmpc.types import DynamicsModel, Plan, PlanInfo, Planner, TransitionSampler
 
 
-class PlanningPolicy:
+class Acted(NamedTuple):
+    """An action, and how it came about.
+
+    Attributes:
+        action: [A], float32, finite and within its bounds.
+        carried: what to pass to the next step of the same episode.
+        info: what the planner found; None if the carried plan had an action left, and none was made.
+        seconds: wall-clock time it took, from the drawing of the worlds to the action.
+        late: whether a plan was made, and took longer than the time budget.
+    """
+
+    action: np.ndarray
+    carried: PlanState
+    info: PlanInfo | None
+    seconds: float
+    late: bool
+
+
+class Controller:
     """Acts by planning through a dynamics model.
+
+    Everything but ``planner`` and the action space may be set anew, and holds from the next plan on.
 
     Args:
         dynamics: the model that worlds are drawn from.
@@ -30,11 +53,12 @@ class PlanningPolicy:
         action_space: bounds of the actions.
         num_particles: P, worlds per plan.
         actions_per_plan: actions performed of each plan before the next one is made.
+        time_budget: seconds that a plan may take, or None; see `act`.
         device: where dynamics and planner compute.
-        time_budget: seconds that a plan may take, or None; see `plan`.
 
     Raises:
-        ValueError: a number is out of its range, or the planner's actions are not those of ``action_space``.
+        TypeError, ValueError: a number is out of its range, or the planner's actions are not those of
+            ``action_space``.
     """
 
     def __init__(
@@ -42,48 +66,75 @@ class PlanningPolicy:
         dynamics: DynamicsModel,
         planner: Planner,
         action_space: spaces.Box,
-        num_particles: int,
-        actions_per_plan: int,
-        device: torch.device,
+        *,
+        num_particles: int = 5,
+        actions_per_plan: int = 1,
         time_budget: float | None = None,
+        device: torch.device | str = "cpu",
     ):
-        is_number = isinstance(time_budget, numbers.Real)
-        if time_budget is not None and not (is_number and math.isfinite(time_budget) and time_budget > 0):
-            raise ValueError(f"time_budget must be a positive number of seconds, or None, got {time_budget!r}")
-        self.time_budget = time_budget
+        self.dynamics, self.planner, self.device = dynamics, planner, torch.device(device)
         self.num_late = 0
         """Plans that took longer than the budget, since this object was made."""
-        self.dynamics, self.planner = dynamics, planner
-        self.num_particles, self.actions_per_plan, self.device = num_particles, actions_per_plan, device
         self.cold = PlanState(planner.initial_plan())
         """Where the first plan of an episode starts from."""
-        self.horizon = self.cold.plan.mean.shape[0]
-        planned, needed = self.cold.plan.mean.shape[1], math.prod(action_space.shape)
+        self.horizon, planned = self.cold.plan.actions.shape
+        needed = math.prod(action_space.shape)
         if planned != needed:
             raise ValueError(f"the planner plans actions of {planned} numbers, the action space has {needed}")
+        self._low, self._high = action_bounds(action_space, self.device)
+        self.num_particles = num_particles
+        self.actions_per_plan = actions_per_plan
+        self.time_budget = time_budget
+
+    @property
+    def num_particles(self) -> int:
+        """P, worlds per plan."""
+        return self._num_particles
+
+    @num_particles.setter
+    def num_particles(self, num_particles: int) -> None:
         check_counts(num_particles=num_particles)
-        if not 1 <= actions_per_plan <= self.horizon:
+        self._num_particles = num_particles
+
+    @property
+    def actions_per_plan(self) -> int:
+        """Actions performed of each plan before the next one is made."""
+        return self._actions_per_plan
+
+    @actions_per_plan.setter
+    def actions_per_plan(self, actions_per_plan: int) -> None:
+        check_counts(actions_per_plan=actions_per_plan)
+        if actions_per_plan > self.horizon:
             raise ValueError(
                 f"actions_per_plan must lie in 1 to the planner's horizon {self.horizon}, got {actions_per_plan}"
             )
-        self._low, self._high = (
-            torch.as_tensor(bound, dtype=torch.float32, device=device).flatten()
-            for bound in (action_space.low, action_space.high)
-        )
+        self._actions_per_plan = actions_per_plan
+
+    @property
+    def time_budget(self) -> float | None:
+        """Seconds that a plan may take, or None."""
+        return self._time_budget
+
+    @time_budget.setter
+    def time_budget(self, time_budget: float | None) -> None:
+        is_number = isinstance(time_budget, numbers.Real)
+        if time_budget is not None and not (is_number and math.isfinite(time_budget) and time_budget > 0):
+            raise ValueError(f"time_budget must be a positive number of seconds, or None, got {time_budget!r}")
+        self._time_budget = time_budget
 
     def worlds(self, generator: torch.Generator) -> Callable[[], TransitionSampler]:
         """One draw of the worlds, made when it is first asked for; plans made together may share it."""
         return cache(lambda: self.dynamics.draw(self.num_particles, self.horizon, generator))
 
     @torch.no_grad()
-    def plan(
+    def act(
         self,
         task: Task,
         observation: np.ndarray,
-        state: PlanState,
+        carried: PlanState,
         generator: torch.Generator,
         worlds: Callable[[], TransitionSampler] | None = None,
-    ) -> tuple[np.ndarray, PlanState, PlanInfo | None]:
+    ) -> Acted:
         """One action from the carried plan; if none of its actions are left, optimise it first.
 
         With a time budget the planner is told until when it may go on, and returns the best plan so far. Drawing the
@@ -92,35 +143,37 @@ class PlanningPolicy:
         Args:
             task: the reward and termination to plan with, as functions of what the model predicts.
             observation: [S_all], as the model sees it (see `modelled.py`).
-            state: what the last step of the same episode returned, or `cold`.
+            carried: what the last step of the same episode returned, or `cold`.
             generator: for the worlds and the planner.
             worlds: of `worlds`; None draws some for this plan alone.
 
-        Returns:
-            The action [A], the state to carry to the next step, and what the planner found (None if no plan was made).
-
         Raises:
-            PlanningError: no candidate had a finite return.
+            PlanningError: no candidate had a finite return, or the planner's result is no plan of its own or would
+                have an action that is not finite.
         """
-        plan, age, info = *state, None
+        started = time.perf_counter()
+        plan, age = carried
+        info, late = None, False
+        if age >= self.actions_per_plan:  # which are fewer now than when it was made
+            plan, age = self.planner.shift(plan, age), 0
         if age == 0:
-            deadline = math.inf if self.time_budget is None else time.perf_counter() + self.time_budget
-            # A planner need not know of deadlines as long as none is asked for.
-            limit = {} if self.time_budget is None else {"deadline": deadline}
+            deadline = None if self.time_budget is None else started + self.time_budget
             drawn = self.worlds(generator)() if worlds is None else worlds()
             start = torch.as_tensor(observation, dtype=torch.float32, device=self.device)
             assert task.reward_fn is not None
             objective = rollout_objective(drawn, task.reward_fn, start, self.num_particles, task.terminated_fn)
             try:
-                plan, info = self.planner.plan(objective, plan, generator, **limit)
+                plan, info = self.planner.plan(objective, plan, generator, deadline=deadline)
+                late = deadline is not None and time.perf_counter() > deadline
+                self._check_planned(plan)
             except PlanningError as error:
                 raise PlanningError(f"{error}; planning started from the observation {observation}") from error
-            self.num_late += time.perf_counter() > deadline
+            self.num_late += late
         # In the precision in which it is stored, so that performing it again is the same.
-        action = plan.mean[age].float().clamp(self._low, self._high).cpu().numpy()
+        action = plan.actions[age].float().clamp(self._low, self._high).cpu().numpy()
         age += 1
-        carried = PlanState(plan, age) if age < self.actions_per_plan else PlanState(self.planner.shift(plan, age))
-        return action, carried, info
+        after = PlanState(plan, age) if age < self.actions_per_plan else PlanState(self.planner.shift(plan, age))
+        return Acted(action, after, info, time.perf_counter() - started, late)
 
     def midpoint(self) -> np.ndarray:
         """The middle of the action range, [A]."""
@@ -130,3 +183,16 @@ class PlanningPolicy:
         """A uniformly random action, [A]."""
         uniform = torch.rand(self._low.shape, generator=generator, device=self.device)
         return (self._low + (self._high - self._low) * uniform).cpu().numpy()
+
+    def _check_planned(self, plan: Plan) -> None:
+        """Raise PlanningError unless a plan can be performed, carried on and saved.
+
+        Once for every planner, so that whatever a planner does nothing that is not finite becomes an action.
+        """
+        name = type(self.planner).__name__
+        expected = {field: (tuple(value.shape), value.dtype) for field, value in self.cold.plan._asdict().items()}
+        received = {field: (tuple(value.shape), value.dtype) for field, value in plan._asdict().items()}
+        if received != expected or plan.actions.shape != self.cold.plan.actions.shape:
+            raise PlanningError(f"{name} must return a plan of the fields {expected}, got {received}")
+        if not plan.actions.isfinite().all():
+            raise PlanningError(f"{name} returned actions that are not finite: {plan.actions.tolist()}")

@@ -1,14 +1,21 @@
-"""The plan that is carried from one control step to the next, and its form in SB3's recurrent `state` slot."""
+"""The plan that is carried from one control step to the next: in the agent, in SB3's `state` slot and in a file.
 
-from typing import NamedTuple
+Nothing here knows what a planner's plan holds; a plan is stacked and taken apart by its own fields.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gym_dgpmpc.types import Plan
 
-PolicyState = tuple[np.ndarray, ...]
-"""Mean [n, H, A], standard deviation [n, H, A] and age [n] of the plans of n environments."""
+PackedPlans = tuple[np.ndarray, ...]
+"""The plans of n environments in SB3's `state` slot: the plan's fields in order, each [n, ...], and the ages [n]."""
+
+AGE = "plan.age"
 
 
 class PlanState(NamedTuple):
@@ -18,28 +25,70 @@ class PlanState(NamedTuple):
     age: int = 0
 
 
-def pack(states: list[PlanState]) -> PolicyState:
+def pack(states: Sequence[PlanState]) -> PackedPlans:
     """The plans of n environments as arrays whose first dimension is n, as SB3 passes them on."""
-    mean = torch.stack([state.plan.mean for state in states]).cpu().numpy()
-    std = torch.stack([state.plan.std for state in states]).cpu().numpy()
-    return mean, std, np.array([state.age for state in states], dtype=np.int64)
+    return tuple(tensor.numpy() for tensor in plans_to_tensors(states).values())
 
 
-def unpack(state: PolicyState, cold: PlanState, num_envs: int, actions_per_plan: int) -> list[PlanState]:
-    """The inverse of `pack`; ``cold`` gives shape, dtype and device.
+def unpack(packed: PackedPlans, cold: PlanState, num_envs: int, actions_per_plan: int) -> list[PlanState]:
+    """The inverse of `pack`; ``cold`` gives fields, shapes, dtypes and device.
 
     Raises:
-        ValueError: the state is not one that this agent's `predict` returned for ``num_envs`` observations.
+        ValueError: it is not what `pack` makes of ``num_envs`` plans of this kind.
     """
-    shape = tuple(cold.plan.mean.shape)
-    shapes = [np.shape(array) for array in state]
-    if shapes != [(num_envs, *shape), (num_envs, *shape), (num_envs,)]:
+    names = list(_shapes(cold, num_envs))
+    if len(packed) != len(names):
+        raise ValueError(f"state must be what predict returned: {len(names)} arrays {names}, got {len(packed)}")
+    tensors = {name: torch.as_tensor(array) for name, array in zip(names, packed, strict=True)}
+    return plans_from_tensors(tensors, cold, num_envs, actions_per_plan)
+
+
+def plans_to_tensors(states: Sequence[PlanState]) -> dict[str, Tensor]:
+    """The plans of n environments, on the CPU: "plan.<field>" [n, ...] of each field, and "plan.age" [n]."""
+    plans = [state.plan._asdict() for state in states]
+    fields = {f"plan.{name}": torch.stack([plan[name] for plan in plans]).cpu() for name in plans[0]}
+    return fields | {AGE: torch.tensor([state.age for state in states], dtype=torch.int64)}
+
+
+def plans_from_tensors(
+    tensors: Mapping[str, Tensor], cold: PlanState, num_envs: int, actions_per_plan: int
+) -> list[PlanState]:
+    """The inverse of `plans_to_tensors`; ``cold`` gives fields, shapes, dtypes and device.
+
+    Raises:
+        KeyError: a field is missing.
+        ValueError: a shape is another, an age is none that a plan is carried at, or an action is not finite.
+    """
+    expected = _shapes(cold, num_envs)
+    found = {name: tuple(tensors[name].shape) for name in expected}
+    if found != expected:
         raise ValueError(
             f"state must be what predict returned for {num_envs} observation(s): arrays of shapes "
-            f"{(num_envs, *shape)} (mean), the same (std) and {(num_envs,)} (age), got {shapes}"
+            f"{_listed(expected)}, got {list(found.values())}"
         )
-    mean, std = (torch.as_tensor(array).to(cold.plan.mean) for array in state[:2])
-    ages = [int(age) for age in state[2]]
+    fields = {
+        name: tensors[f"plan.{name}"].to(device=value.device, dtype=value.dtype)
+        for name, value in cold.plan._asdict().items()
+    }
+    ages = [int(age) for age in tensors[AGE]]
     if not all(0 <= age < actions_per_plan for age in ages):
         raise ValueError(f"the age of a plan lies in 0 to {actions_per_plan - 1} actions, got {ages}")
-    return [PlanState(Plan(mean[i], std[i]), age) for i, age in enumerate(ages)]
+    plans = [plan_of(cold.plan, {name: value[i] for name, value in fields.items()}) for i in range(num_envs)]
+    for plan in plans:
+        if not plan.actions.isfinite().all():
+            raise ValueError(f"the actions of a carried plan must be finite, got {plan.actions}")
+    return [PlanState(plan, age) for plan, age in zip(plans, ages, strict=True)]
+
+
+def plan_of(like: Plan, fields: Mapping[str, Tensor]) -> Plan:
+    """A plan of the kind of ``like``, with these fields."""
+    return cast(Any, type(like))(**fields)
+
+
+def _shapes(cold: PlanState, num_envs: int) -> dict[str, tuple[int, ...]]:
+    fields = {f"plan.{name}": (num_envs, *value.shape) for name, value in cold.plan._asdict().items()}
+    return fields | {AGE: (num_envs,)}
+
+
+def _listed(shapes: Mapping[str, tuple[int, ...]]) -> str:
+    return ", ".join(f"{shape} ({name.removeprefix('plan.')})" for name, shape in shapes.items())

@@ -9,6 +9,7 @@ import torch
 
 from gym_dgpmpc.agents.episode import EpisodeRecord
 from gym_dgpmpc.planning import CEM
+from gym_dgpmpc.types import PlanInfo
 from tests.agents.point_mass import LENGTH, KnownPointMass, LinearModel, agent
 
 OBSERVATION = np.array([0.7, -0.1])
@@ -46,7 +47,7 @@ def test_a_plan_ends_within_its_budget():
     plan = learner.planner.plan
     learner.planner.plan = lambda *arguments, **limit: counted.append(plan(*arguments, **limit)) or counted[-1]
     action, _ = learner.predict(OBSERVATION, deterministic=True)
-    assert counted[0][1].num_iterations == 1
+    assert counted[0][1].metrics["num_iterations"] == 1
     assert learner.action_space.contains(action)
 
 
@@ -79,10 +80,8 @@ def test_a_plan_without_any_time_is_the_shifted_one(capsys):
 
 def test_metrics_count_late_plans_and_leave_out_what_was_not_expected():
     record = EpisodeRecord(1, 2)
-    from gym_dgpmpc.types import PlanInfo
-
     for expected, late in ((float("nan"), True), (3.0, False)):
-        record.add_plan(PlanInfo(expected, 0, 0), 0.1, late=late)
+        record.add_plan(PlanInfo(expected), 0.1, late=late)
         record.add_reward(1.0)
     metrics = record.metrics()
     assert (metrics["planner/num_late"], metrics["planner/expected_return"]) == (1, 3.0)
@@ -94,6 +93,14 @@ def test_metrics_count_late_plans_and_leave_out_what_was_not_expected():
     }
     with pytest.raises(ValueError, match="plans of different counts"):
         restored.load_state_dict({**record.state_dict(), "plan_steps": torch.zeros(5)})
+
+
+def test_a_budget_that_is_set_later_takes_effect_at_once():
+    learner = agent().learn(2 * LENGTH)
+    learner.planning.time_budget = 1e-9
+    with pytest.warns(UserWarning, match="time_budget"):
+        learner.predict(OBSERVATION)
+    assert learner.num_late_plans == 1
 
 
 @pytest.mark.parametrize("budget", [0.0, -1.0, float("nan"), float("inf")])
@@ -139,7 +146,7 @@ class TestCEM:
     )
     def test_no_iteration_begins_that_would_not_end_in_time(self, clock, durations, budget, iterations):
         plan, info = self.plan(clock, durations, None if budget is None else clock[0] + budget)
-        assert info.num_iterations == iterations
+        assert info.metrics["num_iterations"] == iterations
         assert np.isnan(info.expected_return) == (iterations == 0)
         assert (plan.mean.abs() <= 2.0).all()
         assert plan.std.isfinite().all()

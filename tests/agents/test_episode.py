@@ -1,6 +1,9 @@
 """The numbers that an episode is reported by."""
 
+import math
+
 import pytest
+import torch
 
 from gym_dgpmpc.agents import episode
 from gym_dgpmpc.agents.episode import EpisodeRecord
@@ -12,7 +15,7 @@ def record_of(rewards, plans, horizon=2, terminated=False):
     record = EpisodeRecord(3, horizon)
     for step, reward in enumerate(rewards):
         if step in plans:
-            record.add_plan(PlanInfo(plans[step], step, 4), 0.001 * (step + 1))
+            record.add_plan(PlanInfo(plans[step], step, {"num_iterations": 4}), 0.001 * (step + 1))
         record.add_reward(reward, terminated=terminated and step == len(rewards) - 1)
     return record
 
@@ -46,6 +49,45 @@ def test_metrics():
     assert metrics["time/plan_ms"] == pytest.approx(2.0)
     assert metrics["time/plan_ms_p95"] == pytest.approx(2.9)
     assert not any(name.startswith("planner/") for name in record_of([1.0], {}).metrics())
+
+
+def test_metrics_of_any_planner_are_averaged_over_the_plans_that_have_them():
+    record = EpisodeRecord(1, 2)
+    for found in ({"spread": 1.0, "depth": 3}, {"spread": math.nan, "depth": 4}, {"spread": 2.0}, {"none": math.nan}):
+        record.add_plan(PlanInfo(0.0, metrics=found), 0.1)
+        record.add_reward(1.0)
+    metrics = record.metrics()
+    assert (metrics["planner/spread"], metrics["planner/depth"]) == (1.5, 3.5)
+    assert "planner/none" not in metrics
+    loaded = EpisodeRecord(1, 2)
+    loaded.load_state_dict(record.state_dict())
+    assert {name: value for name, value in loaded.metrics().items() if name != "time/ep_seconds"} == {
+        name: value for name, value in metrics.items() if name != "time/ep_seconds"
+    }
+
+
+def test_a_metric_cannot_hide_what_is_logged_of_every_planner():
+    with pytest.raises(ValueError, match="num_late"):
+        EpisodeRecord(1, 2).add_plan(PlanInfo(0.0, metrics={"num_late": 1.0}), 0.1)
+
+
+def test_a_record_of_an_older_file():
+    """In files of the schemas 2 to 4 a plan is a row: expected return, scores that are not finite, iterations."""
+    record = record_of([1.0, 2.0, 4.0, 8.0], {0: 3.0, 2: 20.0})
+    state = record.state_dict()
+    for name in ("expected_return", "num_nonfinite", "metric.num_iterations"):
+        del state[name]
+    old = {**state, "plans": torch.tensor([[3.0, 0.0, 4.0], [20.0, 2.0, 4.0]], dtype=torch.float64)}
+    loaded = EpisodeRecord(3, 2)
+    loaded.load_state_dict(old)
+    assert loaded.plans == record.plans
+    assert all(type(info.num_nonfinite) is int for info in loaded.plans)
+    loaded.load_state_dict(
+        {**old, "plans": torch.zeros(0, 3), "plan_steps": torch.zeros(0), "plan_seconds": torch.zeros(0)}
+    )
+    assert loaded.plans == []
+    with pytest.raises(KeyError, match="expected_return"):
+        loaded.load_state_dict(state)
 
 
 def test_the_time_of_an_episode_goes_on_without_that_between(monkeypatch):

@@ -161,8 +161,8 @@ def test_actions_per_plan(actions_per_plan):
     plans = []
     make = learner.planner.plan
 
-    def recorded(objective, plan, generator):
-        found = make(objective, plan, generator)
+    def recorded(objective, plan, generator, deadline):
+        found = make(objective, plan, generator, deadline)
         plans.append(found[0].mean.numpy().copy())
         return found
 
@@ -178,9 +178,9 @@ def test_every_episode_starts_from_a_cold_plan():
     starts = []
     make = learner.planner.plan
 
-    def recorded(objective, plan, generator):
+    def recorded(objective, plan, generator, deadline):
         starts.append(plan.mean.clone())
-        return make(objective, plan, generator)
+        return make(objective, plan, generator, deadline)
 
     learner.planner.plan = recorded
     learner.learn(3 * LENGTH)

@@ -55,9 +55,9 @@ def test_plans_of_one_moment_share_their_worlds_and_nothing_else():
     learner = agent(several(), dynamics=Counting(), actions_per_plan=2)
     make = learner.planner.plan
 
-    def recorded(objective, plan, generator):
+    def recorded(objective, plan, generator, deadline):
         starts.append(plan.mean.clone())
-        return make(objective, plan, generator)
+        return make(objective, plan, generator, deadline)
 
     learner.planner.plan = recorded
     learner.learn(3 * 2 * LENGTH)

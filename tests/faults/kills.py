@@ -22,7 +22,7 @@ from gym_dgpmpc.checkpoints import folder as run_checkpoints
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.checkpoints.format import read_checkpoint
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
-from gym_dgpmpc.planning.controller import PlanningPolicy
+from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.runs import run as _imported_before_the_fork  # noqa: F401  # with Matplotlib, which takes seconds
 from tests.faults.compare import checkpoint_differences, folder_differences, log_differences
 from tests.runs.toy import ToyPush
@@ -112,7 +112,7 @@ class Watch:
         """In the child: tell what it does."""
         for owner, method, phase in (
             (DeepGPDynamics, "fit", "training"),
-            (PlanningPolicy, "plan", "planning"),
+            (Controller, "act", "planning"),
             (DeepGPDynamics, "resample", "re-sampling"),
             (RunCheckpoints, "save", "checkpointing"),
         ):

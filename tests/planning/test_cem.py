@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import scipy.stats
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from gym_dgpmpc.errors import PlanningError
 from gym_dgpmpc.planning import CEM, rollout_objective
-from gym_dgpmpc.planning.cem import elite_shares, truncated_normal
-from gym_dgpmpc.types import Plan
+from gym_dgpmpc.planning.cem import GaussianPlan, elite_shares, truncated_normal
 from tests.oracles import lqr
 
 CPU = torch.device("cpu")
@@ -44,12 +46,17 @@ def test_the_ends_of_the_uniform_draw_stay_finite(monkeypatch, uniform):
     assert noise.item() == pytest.approx(scipy.stats.truncnorm.ppf(uniform, -2.0, 2.0), abs=1e-5)
 
 
+@pytest.mark.parametrize(("num_candidates", "num_elites"), [(300, 30), (19, 1), (3, 1)])
+def test_a_tenth_of_the_candidates_are_elites(num_candidates, num_elites):
+    assert CEM(**bounds([-1.0], [1.0]), num_candidates=num_candidates).num_elites == num_elites
+
+
 def test_every_plan_starts_from_a_quarter_of_the_range():
     cem = CEM(**bounds([-3.0, 0.0], [3.0, 2.0]), horizon=2)
     plan = cem.initial_plan()
     assert torch.equal(plan.mean, torch.tensor([[0.0, 1.0]] * 2))
     assert torch.equal(plan.std, torch.tensor([[1.5, 0.5]] * 2))
-    narrowed = Plan(torch.tensor([[1.0, 0.5], [2.0, 1.5]]), torch.full((2, 2), 1e-3))
+    narrowed = GaussianPlan(torch.tensor([[1.0, 0.5], [2.0, 1.5]]), torch.full((2, 2), 1e-3))
     assert torch.equal(cem.shift(narrowed, 1).std, plan.std)
 
 
@@ -59,7 +66,7 @@ def test_the_recursion_is_the_one_computed_by_hand():
         **bounds([-1.0], [1.0], torch.float64), horizon=1, num_candidates=6, num_elites=2, num_iterations=2,
         smoothing=0.25, min_std=0.0,
     )  # fmt: skip
-    start = Plan(torch.tensor([[0.8]], dtype=torch.float64), torch.tensor([[0.5]], dtype=torch.float64))
+    start = GaussianPlan(torch.tensor([[0.8]], dtype=torch.float64), torch.tensor([[0.5]], dtype=torch.float64))
     seen = []
 
     def objective(actions):
@@ -135,7 +142,7 @@ def test_an_action_that_cannot_vary_does_not_keep_it_from_stopping():
     for low, high in (([-1.0], [1.0]), ([-1.0, 0.1], [1.0, 0.1])):
         cem = CEM(**bounds(low, high), **settings)
         plan, info = cem.plan(distance, cem.initial_plan(), seeded())
-        counts.append(info.num_iterations)
+        counts.append(info.metrics["num_iterations"])
     assert max(counts) < 20
     assert torch.equal(plan.mean[:, 1], torch.full((3,), 0.1))
 
@@ -144,7 +151,7 @@ def test_an_action_that_cannot_vary_does_not_keep_it_from_stopping():
 def test_it_stops_when_the_plan_is_narrow(min_std, expected):
     cem = CEM(**bounds([-1.0], [1.0]), horizon=3, min_std=min_std)
     _, info = cem.plan(lambda actions: actions.sum(dim=(1, 2)), cem.initial_plan(), seeded())
-    assert info.num_iterations == expected
+    assert info.metrics["num_iterations"] == expected
 
 
 def test_plans_do_not_depend_on_the_units_of_the_action():
@@ -155,7 +162,7 @@ def test_plans_do_not_depend_on_the_units_of_the_action():
         plan, info = cem.plan(
             lambda actions, scale=scale: -(actions / scale - 0.3).square().sum(dim=(1, 2)), cem.initial_plan(), seeded()
         )
-        plans.append((plan.mean / scale, info.num_iterations))
+        plans.append((plan.mean / scale, info.metrics["num_iterations"]))
     assert torch.equal(plans[0][0], plans[1][0]) and plans[0][1] == plans[1][1] < 30
 
 
@@ -209,6 +216,64 @@ class TestAgainstLQR:
         assert -objective(uniform).max().item() - optimum > nothing
         assert excess < explored
         assert excess < 0.1 * nothing  # the largest of 100 seeds: 0.061
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    widths=st.lists(st.tuples(st.floats(-1e3, 1e3), st.floats(0.0, 1e6)), min_size=1, max_size=3),
+    where=st.floats(0.0, 1.0),
+    pull=st.floats(-1.0, 1.0),
+    seed=st.integers(0, 2**31),
+)
+def test_from_a_mean_at_a_bound_there_is_no_way_out(widths, where, pull, seed):
+    """There is no room to explore, for an action that is fixed nowhere."""
+    low = torch.tensor([lower for lower, _ in widths])
+    high = torch.maximum(torch.tensor([lower + width for lower, width in widths]), low)
+    cem = CEM(low, high, horizon=2, num_candidates=16, num_elites=3, num_iterations=3)
+
+    def objective(actions):
+        assert bool((actions >= low).all()) and bool((actions <= high).all())
+        return pull * actions.sum(dim=(1, 2))
+
+    mean = (low + where * (high - low)).clamp(low, high).expand(2, -1)
+    plan, _ = cem.plan(objective, cem.initial_plan()._replace(mean=mean), seeded(seed))
+    assert bool((plan.mean >= low).all()) and bool((plan.mean <= high).all())
+    assert bool(plan.std.isfinite().all()) and bool((plan.std >= 0).all())
+
+
+def test_no_finite_score_is_an_error_that_says_how_many():
+    cem = CEM(**bounds([-1.0], [1.0]), horizon=2, num_candidates=64)
+    calls = iter([torch.zeros(64), torch.full((64,), math.nan)])
+    with pytest.raises(PlanningError, match=r"none of the 64 candidate.*iteration 2 \(64 non-finite"):
+        cem.plan(lambda actions: next(calls), cem.initial_plan(), seeded())
+
+
+def test_an_objective_of_the_wrong_shape_is_named():
+    cem = CEM(**bounds([-1.0], [1.0]), horizon=2, num_candidates=64)
+    with pytest.raises(ValueError, match=r"shape \(64,\), got \(64, 1\)"):
+        cem.plan(lambda actions: actions[:, :1, 0], cem.initial_plan(), seeded())
+
+
+def test_what_a_shift_leaves_open_is_the_middle():
+    cem = CEM(**bounds([-1.0], [3.0]), horizon=3)
+    plan = GaussianPlan(torch.tensor([[0.1], [0.2], [0.3]]), torch.full((3, 1), 0.01))
+    assert torch.equal(cem.shift(plan, 2).mean, torch.tensor([[0.3], [1.0], [1.0]]))
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        (GaussianPlan(torch.zeros(3, 2), torch.ones(3, 2)), r"plan.mean must have shape \(4, 2\).*got \(3, 2\)"),
+        (GaussianPlan(torch.zeros(4, 2), torch.ones(4, 2).double()), r"plan.std must have.*float32, got .*float64"),
+        (GaussianPlan(torch.full((4, 2), math.nan), torch.ones(4, 2)), r"plan.mean must be finite, got .*nan"),
+    ],
+)
+def test_a_plan_of_another_planner_is_refused(plan, message):
+    cem = CEM(**bounds([-1.0, -2.0], [1.0, 3.0]), horizon=4)
+    with pytest.raises(ValueError, match=message):
+        cem.plan(lambda actions: actions.sum(dim=(1, 2)), plan, seeded())
+    with pytest.raises(ValueError, match=message):
+        cem.shift(plan, 1)
 
 
 @pytest.mark.parametrize(

@@ -152,10 +152,10 @@ def test_what_was_finished_survives_a_failure(tmp_path, monkeypatch):
     def fail_from_the_third_episode_on(*args, **kwargs):
         if run.agent.num_timesteps >= 24:
             raise PlanningError("nothing is finite")
-        return plan(*args, **kwargs)
+        return act(*args, **kwargs)
 
-    plan = run.agent.planning.plan
-    monkeypatch.setattr(run.agent.planning, "plan", fail_from_the_third_episode_on)
+    act = run.agent.planning.act
+    monkeypatch.setattr(run.agent.planning, "act", fail_from_the_third_episode_on)
     with pytest.raises(PlanningError):
         run.train(progress_bar=False)
     assert len(run.folder.rows()) == 2

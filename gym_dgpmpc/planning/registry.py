@@ -1,0 +1,86 @@
+"""Planners by name: what agents, files and the command line call them.
+
+A new planner is one line, ``register_planner("my-planner", MyPlanner)``; an agent then takes ``planner="my-planner"``.
+"""
+
+import re
+from typing import Any
+
+import torch
+from gymnasium import spaces
+
+from gym_dgpmpc.planning.cem import CEM
+from gym_dgpmpc.types import Planner, PlannerFactory
+
+PLANNERS: dict[str, PlannerFactory] = {"cem": CEM}
+"""The registered planners; add to them with `register_planner`."""
+
+
+def register_planner(name: str, factory: PlannerFactory) -> None:
+    """Let a planner be made by name.
+
+    Args:
+        name: lower-case words, digits included, with hyphens or underscores between them.
+        factory: the planner's class, or a function that makes one; see `Planner`.
+
+    Raises:
+        ValueError: the name has another form, or is that of another planner.
+        TypeError: the factory cannot be called.
+    """
+    if not re.fullmatch(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*", name):
+        raise ValueError(f"a planner's name is lower-case words such as 'my-planner', got {name!r}")
+    if not callable(factory):
+        raise TypeError(f"a planner's factory is a class or a function, got {factory!r}")
+    if PLANNERS.setdefault(name, factory) is not factory:
+        raise ValueError(f"the name {name!r} is taken by {PLANNERS[name]!r}: choose another one")
+
+
+def planner_factory(planner: str | PlannerFactory) -> PlannerFactory:
+    """The class or function that makes a planner of this name; one that is given in place of a name is returned.
+
+    Raises:
+        ValueError: there is no planner of this name.
+        TypeError: it is neither a name nor can it be called.
+    """
+    if isinstance(planner, str):
+        if planner not in PLANNERS:
+            raise ValueError(f"there is no planner {planner!r}; registered are {sorted(PLANNERS)}")
+        return PLANNERS[planner]
+    if not callable(planner):
+        raise TypeError(f"a planner is given by name, class, function or as an object, got {planner!r}")
+    return planner
+
+
+def make_planner(
+    planner: str | PlannerFactory | Planner,
+    action_space: spaces.Box,
+    device: torch.device | str = "cpu",
+    **settings: Any,
+) -> Planner:
+    """A planner of actions in this space.
+
+    Args:
+        planner: a registered name, a class or function that makes one, or a ready-made planner, which is returned.
+        action_space: its bounds are the planner's, in float32 and flattened to [A].
+        device: where it computes.
+        settings: its keyword arguments; none for a ready-made one.
+
+    Raises:
+        ValueError: there is no planner of this name, or a setting is out of its range.
+        TypeError: a setting that the planner does not have, or with a ready-made planner any.
+    """
+    if isinstance(planner, Planner) and not isinstance(planner, type):
+        if settings:
+            raise TypeError(f"a ready-made planner has its settings already, got {sorted(settings)} with it")
+        return planner
+    low, high = action_bounds(action_space, device)
+    return planner_factory(planner)(low, high, **settings)
+
+
+def action_bounds(action_space: spaces.Box, device: torch.device | str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Lower and upper bounds of the actions, float32 [A]."""
+    low, high = (
+        torch.as_tensor(bound, dtype=torch.float32, device=device).flatten()
+        for bound in (action_space.low, action_space.high)
+    )
+    return low, high
