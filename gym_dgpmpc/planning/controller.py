@@ -57,8 +57,8 @@ class Controller:
         device: where dynamics and planner compute.
 
     Raises:
-        TypeError, ValueError: a number is out of its range, or the planner's actions are not those of
-            ``action_space``.
+        TypeError, ValueError: a number is out of its range, the planner's plans are none, or their actions are not
+            those of ``action_space``.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Controller:
         self.dynamics, self.planner, self.device = dynamics, planner, torch.device(device)
         self.num_late = 0
         """Plans that took longer than the budget, since this object was made."""
-        self.cold = PlanState(planner.initial_plan())
+        self.cold = PlanState(_checked_fields(planner))
         """Where the first plan of an episode starts from."""
         self.horizon, planned = self.cold.plan.actions.shape
         needed = math.prod(action_space.shape)
@@ -196,3 +196,13 @@ class Controller:
             raise PlanningError(f"{name} must return a plan of the fields {expected}, got {received}")
         if not plan.actions.isfinite().all():
             raise PlanningError(f"{name} returned actions that are not finite: {plan.actions.tolist()}")
+
+
+def _checked_fields(planner: Planner) -> Plan:
+    """A planner's initial plan, if it can be carried and saved by its fields."""
+    plan, name = planner.initial_plan(), type(planner).__name__
+    if not isinstance(plan, Plan) or not all(isinstance(value, torch.Tensor) for value in plan._asdict().values()):
+        raise TypeError(f"the plans of {name} must be NamedTuples of tensors that have `actions`, got {plan!r}")
+    if "age" in plan._asdict():
+        raise ValueError(f"the plans of {name} have a field 'age', which a carried plan has itself: rename it")
+    return plan

@@ -2,6 +2,7 @@
 
 import math
 import time
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -139,6 +140,31 @@ def test_settings_are_checked_when_they_are_set(setting, value, error, unchecked
 def test_a_planner_of_other_actions_is_refused():
     planner = RandomShooting(torch.zeros(2), torch.ones(2), horizon=4)
     with pytest.raises(ValueError, match="actions of 2 numbers, the action space has 1"):
+        Controller(Drifting(), planner, SPACE)
+
+
+class Aged(NamedTuple):
+    age: torch.Tensor
+    actions: torch.Tensor
+
+
+class Counted(NamedTuple):
+    count: int
+    actions: torch.Tensor
+
+
+@pytest.mark.parametrize(
+    ("plan", "error", "message"),
+    [
+        (torch.zeros(4, 1), TypeError, "RandomShooting must be NamedTuples.*tensor"),
+        (Counted(3, torch.zeros(4, 1)), TypeError, r"RandomShooting must be NamedTuples.*count=3"),
+        (Aged(torch.zeros(4, 1), torch.zeros(4, 1)), ValueError, "'age'"),
+    ],
+)
+def test_plans_that_cannot_be_carried_are_refused(plan, error, message, unchecked):
+    planner = RandomShooting(torch.zeros(1), torch.ones(1))
+    planner.initial_plan = lambda: plan
+    with pytest.raises(error, match=message):
         Controller(Drifting(), planner, SPACE)
 
 
