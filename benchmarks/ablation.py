@@ -60,9 +60,9 @@ def measure(wanted: Row) -> Row:
     data = random_episode(source, seed, 0.0)
     env = gymnasium.make(env_id, max_episode_steps=steps)
     agent = DGPMPCAgent(env, seed=seed, **{**PAPER.get(env_id, {}), **VARIANTS[variant]})
-    assert agent.task.reward_fn is not None
+    assert agent.task.functions.reward_fn is not None
     columns = {name: value.numpy() for name, value in data._asdict().items()}
-    agent.add_transitions({**columns, "reward": agent.task.reward_fn(*data).numpy()})
+    agent.add_transitions({**columns, "reward": agent.task.functions.reward_fn(*data).numpy()})
     agent.learn(0)
     row: Row = {}
     tests = [random_episode(source, test_seed, 0.8) for test_seed in TEST_SEEDS]

@@ -1,10 +1,12 @@
 """Checks of settings that every part has."""
 
+import difflib
 import numbers
+from collections.abc import Iterable
 
 
 def check_counts(**counts: object) -> None:
-    """Refuse settings that count something and are no whole number, or less than one.
+    """Refuse settings that count something and are not a whole number, or are less than one.
 
     Raises:
         TypeError, ValueError: naming the setting and its value.
@@ -14,3 +16,9 @@ def check_counts(**counts: object) -> None:
             raise TypeError(f"{name} must be a whole number, got {value!r}")
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
+
+
+def closest(name: str, known: Iterable[str]) -> str:
+    """For an error's text: " (did you mean ...?)" with the known names that look like ``name``, or nothing."""
+    near = difflib.get_close_matches(name, list(known))
+    return f" (did you mean {' or '.join(map(repr, near))}?)" if near else ""

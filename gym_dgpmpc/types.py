@@ -19,8 +19,19 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-StateDict = dict[str, Tensor | int | float | str]
-"""A flat mapping, dotted keys, of tensors and plain values: what goes into a checkpoint, and nothing else."""
+StateDict = dict[str, Any]
+"""A flat mapping, dotted keys, of tensors and of values that JSON has: what goes into a checkpoint."""
+
+
+@runtime_checkable
+class Stateful(Protocol):
+    """Something that a checkpoint keeps. It alone knows its fields, their limits, and what an older file lacks."""
+
+    def state_dict(self) -> StateDict: ...
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Go on from `state_dict`; any exception says that the state does not fit."""
+        ...
 
 
 class Transitions(NamedTuple):

@@ -1,37 +1,84 @@
 """Model-predictive control with any dynamics model and any planner, as a Stable-Baselines3 algorithm.
 
 Learning is Algorithm 2 of Gadd et al. (2020), "Sample-Efficient Reinforcement Learning using Deep Gaussian
-Processes"; it stands in one function, `MPCAgent._control`.
+Processes"; it stands in one function, `MPCAgent._control`. The agent *has* a task (what to do, what to predict), a
+controller (model and planner) and a collector (the running episodes); `arguments.py` reads how it was made.
 """
 
+import inspect
 import os
 import time
+import warnings
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, TypeVar
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger, configure
-from stable_baselines3.common.type_aliases import MaybeCallback
-from stable_baselines3.common.utils import configure_logger
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
+from stable_baselines3.common.vec_env import VecEnv
 
-from gym_dgpmpc.agents.acting import ActingAgent
+from gym_dgpmpc.agents.arguments import (
+    AGENT,
+    UNSET,
+    PlanningArguments,
+    called_in_order,
+    composed_documentation,
+    composed_signature,
+)
+from gym_dgpmpc.agents.collector import Collector
 from gym_dgpmpc.agents.episode import EpisodeRecord
-from gym_dgpmpc.agents.running import next_episode
-from gym_dgpmpc.checkpoints.collect import pending_logs
+from gym_dgpmpc.agents.logs import Logs
+from gym_dgpmpc.agents.policy import MPCPolicy
+from gym_dgpmpc.checkpoints.collect import collect
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
-from gym_dgpmpc.checkpoints.safeguard import Safeguard
-from gym_dgpmpc.errors import EnvironmentDataError
+from gym_dgpmpc.checkpoints.format import CheckpointPath, write_checkpoint
+from gym_dgpmpc.checkpoints.interface import StateOf
+from gym_dgpmpc.checkpoints.restore import load_agent
+from gym_dgpmpc.checkpoints.safeguard import Guard, safeguard
+from gym_dgpmpc.checks import check_counts
+from gym_dgpmpc.data.transitions import TransitionStore
+from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError, ReliabilityWarning
+from gym_dgpmpc.planning.controller import Controller
+from gym_dgpmpc.planning.plan_state import PackedPlans
+from gym_dgpmpc.planning.registry import is_ready_made, make_planner, planner_factory
+from gym_dgpmpc.randomness import Generators, derive_seed, fresh_seed, split_seed
+from gym_dgpmpc.settings import Setting, joined, refuse_unknown, settings_of
+from gym_dgpmpc.tasks.dict_observations import FlatDict
+from gym_dgpmpc.tasks.environment import flat_size, wrapped_env
+from gym_dgpmpc.tasks.functions import Learned
+from gym_dgpmpc.tasks.logged import Logged, read_logged
 from gym_dgpmpc.tasks.reward_guard import disagreements
+from gym_dgpmpc.tasks.task import Task, TaskArguments
+from gym_dgpmpc.types import (
+    DynamicsFactory,
+    DynamicsModel,
+    ObservationSpec,
+    Planner,
+    PlannerFactory,
+    RewardFn,
+    StateDict,
+    Stateful,
+    TerminatedFn,
+)
 
 SelfAgent = TypeVar("SelfAgent", bound="MPCAgent")
 
-
 ENDLESS = 1000
-"""Random steps after which it is told that no episode has ended. Gymnasium's own tasks have at most as many."""
+"""Random steps after which a warning says that no episode has ended. Gymnasium's own tasks have at most as many."""
+
+LARGEST_COUNT = 1 << 53
+"""What a file may claim of a counter."""
 
 
-class MPCAgent(ActingAgent):
+class MPCAgent(BaseAlgorithm):
     """Learns a dynamics model from its own experience and acts by planning through it.
 
     The first steps are uniformly random. From then on the model is trained at each episode's start, and every action
@@ -45,18 +92,21 @@ class MPCAgent(ActingAgent):
     transitions go into one store, and the model is re-sampled once for each step of all.
 
     Args:
+        policy: "MPCPolicy", the only one there is; it may be left out: ``MPCAgent(env, ...)``.
         env: the environment, its id, or a VecEnv; actions a bounded Box, observations a vector or a Dict of vectors.
         dynamics: the model to learn; or a function (observation size, action size, `ObservationSpec`) -> model, which
             is needed if the model has to predict reward or termination too, and may be called again when that is found.
-        planner: the optimiser of action sequences; its horizon is the plan's.
+        planner: the optimiser of action sequences: a name ("cem", or what `register_planner` added), a class or
+            function that makes one, or a ready-made planner. Its settings are further arguments of the agent, except of
+            a ready-made one.
         reward_fn: r(s, a, s'), batched over leading dimensions, in torch. None: the environment's ``reward_fn`` or
             `compute_reward`, or what is known of Gymnasium's own; if there is none, or with "learned", the model
             predicts it.
         terminated_fn: whether an episode ends in s', batched likewise. None: the environment's ``terminated_fn`` (which
             may be None: never), or what is known; if there is none, or with "learned", the model predicts it from the
             first termination on.
-        observation_spec: how a model that ``dynamics`` makes reads observations; default: the environment's
-            ``observation_spec``, or what is known. Of a Dict it means the vector of the parts in alphabetical order.
+        observation_spec: how the model reads observations; default: the environment's ``observation_spec``, or what is
+            known. For Dict observations it indexes the vector of the parts in alphabetical order.
         num_particles: P, worlds drawn for each plan.
         actions_per_plan: actions performed of each plan before the next one is made.
         learning_starts: transitions before the first training, of random actions if they were not logged; default:
@@ -70,20 +120,263 @@ class MPCAgent(ActingAgent):
         verbose: 0 for silence, 1 for one line per episode, 2 for SB3's tables of logged values besides.
         seed: decides everything random: environment, exploration, training and planning. None draws one, kept in
             ``agent.seed``, and leaves the environment's own seed alone.
-        device: where planning computes ("cpu", "cuda", or "auto"); dynamics and planner must live there too.
+        device: where planning computes: "cpu", "cuda", or "auto" for the second where there is one.
 
     Raises:
         ValueError: an argument is out of its range, or the environment is one that cannot be planned for.
+        TypeError: there is no such setting.
         AssertionError: the action space is not a Box, as from every SB3 algorithm.
         UnknownRewardError: there is no reward function, and the model cannot be given the reward to predict.
     """
 
+    policy: MPCPolicy
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(
+        ("MPCPolicy", "MlpPolicy", "MultiInputPolicy"), MPCPolicy
+    )
+    observation_space: spaces.Box
+    action_space: spaces.Box
+    seed: int
+    _last_obs: np.ndarray | None
+
+    dynamics_class: ClassVar[Callable[..., DynamicsModel] | None] = None
+    """Of a named agent, the model that it is made of; its settings are arguments of the agent."""
+    planner_defaults: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+    """Of a named agent, the planner's settings that differ from the planner's own defaults."""
+    largest: ClassVar[Mapping[str, int]] = MappingProxyType({"num_particles": 10**4})
+    """What a file may claim; see `settings_of`."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """A named agent's signature and documentation are made of those of its parts."""
+        super().__init_subclass__(**kwargs)
+        if cls.dynamics_class is not None:
+            parts = (cls.own_settings(), settings_of(cls.dynamics_class), settings_of(planner_factory("cem")))
+            cls.__signature__ = composed_signature(cls, *parts)  # type: ignore[attr-defined]
+            cls.__doc__ = composed_documentation(cls, *parts)
+            for name in joined(*parts[1:]):
+                if name != "learning_rate":  # SB3 has an attribute of that name
+                    setattr(cls, name, _property(name))
+
+    def __init__(
+        self,
+        *args: Any,
+        policy: str | type[BasePolicy] = "MPCPolicy",
+        env: GymEnv | str | None = UNSET,
+        dynamics: DynamicsModel | DynamicsFactory | None = None,
+        planner: str | PlannerFactory | Planner | None = None,
+        reward_fn: RewardFn | Learned | None = None,
+        terminated_fn: TerminatedFn | Learned | None = None,
+        observation_spec: ObservationSpec | None = None,
+        num_particles: int = 5,
+        actions_per_plan: int = 1,
+        learning_starts: int | None = None,
+        train_freq: int | None = None,
+        time_budget: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | os.PathLike[str] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: torch.device | str = "cpu",
+        _init_setup_model: bool = True,
+        **settings: Any,
+    ):
+        policy, env, dynamics, planner = called_in_order(type(self).__name__, args, policy, env, dynamics, planner)
+        optional = {"learning_starts": learning_starts, "train_freq": train_freq}
+        check_counts(**{name: count for name, count in optional.items() if count is not None})
+        self._planner_given = "cem" if planner is None else planner
+        self.settings = self._complete(settings, self._planner_given, dynamics)
+        if env is not None:
+            env = wrapped_env(env)
+        super().__init__(
+            policy=policy,
+            env=env,
+            learning_rate=self.settings.get("learning_rate", 0.0),
+            stats_window_size=stats_window_size,
+            tensorboard_log=None if tensorboard_log is None else os.fspath(tensorboard_log),
+            device=device,
+            seed=seed,
+            support_multi_env=True,
+            supported_action_spaces=(spaces.Box,),
+        )
+        self.verbose = verbose
+        self.learning_starts, self.train_freq = learning_starts, train_freq
+        self._task_given = TaskArguments(reward_fn, terminated_fn, observation_spec)
+        self._planning_given = PlanningArguments(num_particles, actions_per_plan, time_budget)
+        self._dynamics_given = dynamics
+        self.seeds_environment = seed is not None
+        self.seed = fresh_seed() if seed is None else seed
+        if _init_setup_model:
+            if self.seeds_environment:
+                super().set_random_seed(self.seed)
+            self._setup_model()
+
+    # ------------------------------------------------------------------------------------------ what it is made of
+
+    @classmethod
+    def own_settings(cls) -> dict[str, Setting]:
+        """The settings that every agent has, whatever it is made of."""
+        own = settings_of(MPCAgent)
+        changed = inspect.signature(cls.__init__).parameters  # a named agent may have another default
+        return {
+            name: replace(own[name], default=changed[name].default if name in changed else own[name].default)
+            for name in AGENT
+        }
+
+    @classmethod
+    def part_settings(cls, planner: str | PlannerFactory | Planner) -> dict[str, Setting]:
+        """The settings of the model, and of the planner unless it is a ready-made one."""
+        of_model = {} if cls.dynamics_class is None else settings_of(cls.dynamics_class)
+        of_planner = {} if is_ready_made(planner) else settings_of(planner_factory(planner))
+        return joined(of_model, of_planner)
+
+    def _complete(self, settings: dict[str, Any], planner: Any, dynamics: Any) -> Mapping[str, Any]:
+        """Every setting of model and planner, the defaults where none is given."""
+        name, known = type(self).__name__, self.part_settings(planner)
+        if self.dynamics_class is not None and dynamics is not None:
+            raise TypeError(f"a {name} makes its own dynamics model: MPCAgent takes any, got dynamics={dynamics!r}")
+        refuse_unknown(name, settings, {**known, **self.own_settings()})
+        defaults = {each.name: each.default for each in known.values()}
+        defaults |= {each: value for each, value in self.planner_defaults.items() if each in known}
+        return MappingProxyType({**defaults, **settings})
+
+    def _setting(self, name: str) -> Any:
+        if name not in self.settings:
+            raise AttributeError(f"this agent's planner has no setting {name!r}; there are {sorted(self.settings)}")
+        return self.settings[name]
+
     def _setup_model(self) -> None:
-        super()._setup_model()
-        self._pending_logs: list[tuple[str, float, int, Any]] = []  # of a checkpoint, for the logger of `learn`
-        self._log_run: str | None = None  # the folder under `tensorboard_log` that a run with a folder logs in
-        self._safeguard: Safeguard | None = None
+        """Create what an untrained agent has, once the spaces are known."""
+        self.store = TransitionStore(flat_size(self.observation_space), flat_size(self.action_space))
+        self.generators: Generators = split_seed(self.seed, self.device)
+        self.task = Task(self.env, self.observation_space, self.action_space, self._task_given, self.device)
+        of_planner = set(self.part_settings(self._planner_given)) - set(self._model_settings())
+        planner = make_planner(
+            self._planner_given, self.action_space, self.device, **{name: self.settings[name] for name in of_planner}
+        )
+        self.num_fitted = 0  # transitions that the last training saw
+        self.controller = Controller(
+            self._new_dynamics(), planner, self.action_space, *self._planning_given, device=self.device
+        )
+        self.collector = Collector(self.store, self.n_envs, self.controller)
+        self.logs = Logs(self)
+        self.policy = MPCPolicy(self.observation_space, self.action_space, self)
+        self._training_context: Callable[[], AbstractContextManager[None]] = nullcontext
         self._has_described = False  # whether it was said where reward and termination come from
+        self._warned: set[str] = set()
+
+    def _model_settings(self) -> dict[str, Any]:
+        names = () if self.dynamics_class is None else settings_of(self.dynamics_class)
+        return {name: self.settings[name] for name in names}
+
+    def _make_dynamics(
+        self, observation_size: int, action_size: int, observation_spec: ObservationSpec
+    ) -> DynamicsModel | None:
+        """An untrained model of such transitions, or None if the agent was given a ready-made one."""
+        if self.dynamics_class is not None:
+            return self.dynamics_class(
+                observation_size, action_size, observation_spec, **self._model_settings(), device=self.device
+            )
+        given = self._dynamics_given
+        if isinstance(given, DynamicsModel) and not isinstance(given, type):  # a class makes models
+            return None
+        if given is None:
+            raise ValueError("an MPCAgent is made of a dynamics model and a planner: pass dynamics=...")
+        return given(observation_size, action_size, observation_spec)
+
+    def _new_dynamics(self) -> DynamicsModel:
+        """An untrained model of what the task wants predicted; the ready-made one, if the agent was given one.
+
+        Raises:
+            UnknownRewardError: that cannot be given more to predict than the observation.
+        """
+        modelled = self.task.modelled
+        made = self._make_dynamics(modelled.size, flat_size(self.action_space), modelled.spec)
+        self.task.can_model_more = made is not None
+        if made is not None:
+            return made
+        if modelled.reward or modelled.terminated:
+            raise self.task.unknown_reward()
+        assert isinstance(self._dynamics_given, DynamicsModel)
+        return self._dynamics_given
+
+    def _model_anew(self, *, reward: bool, terminated: bool) -> None:
+        """Begin with an untrained model, of the observation and what else it is to predict."""
+        self.task.model(reward=reward, terminated=terminated)
+        self.controller.dynamics, self.num_fitted = self._new_dynamics(), 0
+
+    # Each has one owner; these are their names on the agent.
+
+    @property
+    def dynamics(self) -> DynamicsModel:
+        """The model that worlds are drawn from."""
+        return self.controller.dynamics
+
+    @property
+    def planner(self) -> Planner:
+        """The optimiser of action sequences."""
+        return self.controller.planner
+
+    @property
+    def num_particles(self) -> int:
+        """P, worlds drawn for each plan; may be set."""
+        return self.controller.num_particles
+
+    @num_particles.setter
+    def num_particles(self, num_particles: int) -> None:
+        self.controller.num_particles = num_particles
+
+    @property
+    def actions_per_plan(self) -> int:
+        """Actions performed of each plan; may be set."""
+        return self.controller.actions_per_plan
+
+    @actions_per_plan.setter
+    def actions_per_plan(self, actions_per_plan: int) -> None:
+        self.controller.actions_per_plan = actions_per_plan
+
+    @property
+    def time_budget(self) -> float | None:
+        """Seconds that a plan may take, or None; may be set."""
+        return self.controller.time_budget
+
+    @time_budget.setter
+    def time_budget(self, time_budget: float | None) -> None:
+        self.controller.time_budget = time_budget
+
+    @property
+    def observation_spec(self) -> ObservationSpec:
+        """How the model reads observations."""
+        return self.task.modelled.observation_spec
+
+    @property
+    def stats_window_size(self) -> int:
+        """Episodes that the logged means are over."""
+        return self._stats_window_size
+
+    @property
+    def num_late_plans(self) -> int:
+        """Plans that took longer than ``time_budget``, of `learn` and `predict` together, since the agent was made."""
+        return self.controller.num_late
+
+    @property
+    def episode_records(self) -> list[EpisodeRecord]:
+        """What happened so far in each environment's running episode, or in the one that has just ended."""
+        return self.collector.records
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the dynamics model has been trained."""
+        return self.num_fitted > 0
+
+    @property
+    def is_exploring(self) -> bool:
+        """Whether the next actions are random because there are too few transitions to learn from."""
+        if self.is_fitted:
+            return False
+        if self.learning_starts is None:
+            # An episode that never ends must not put off the first training beyond the others.
+            enough = self.train_freq is not None and len(self.store) >= self.train_freq
+            return not enough and not self.collector.all_explored
+        return len(self.store) < self.learning_starts
 
     @property
     def is_training_due(self) -> bool:
@@ -92,6 +385,63 @@ class MPCAgent(ActingAgent):
         starts = self._last_episode_starts is not None and bool(self._last_episode_starts.any())
         due = starts if self.train_freq is None else num_new >= self.train_freq
         return num_new > 0 and not self.is_exploring and (due or not self.is_fitted)
+
+    # ------------------------------------------------------------------------------------------------ environments
+
+    def get_env(self) -> VecEnv | None:
+        """The environment as a VecEnv, with the Dict observations that it may have."""
+        return self.env.venv if isinstance(self.env, FlatDict) else self.env
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Go on in another environment of the same spaces; its reward is planned with, unless one was given.
+
+        One that is refused leaves the agent as it is.
+
+        Raises:
+            ValueError: its spaces are others, or it cannot be planned for.
+            UnknownRewardError: there is no reward function, and the model was not trained to predict the reward.
+        """
+        env = wrapped_env(env)
+        check_for_correct_spaces(env, self.observation_space, self.action_space)  # so that a refusal changes nothing
+        found = self.task.find(env)
+        if found.reward_fn is None and not self.task.modelled.reward:
+            if self.is_fitted or not self.task.can_model_more:
+                raise self.task.unknown_reward(env)
+            self._model_anew(reward=True, terminated=self.task.modelled.terminated)
+        self.n_envs = env.num_envs  # which may be another number than before
+        super().set_env(env, force_reset)
+        self.task.move(env, found)
+        if self.collector.resize(self.n_envs):
+            self._last_obs = None
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Start all random streams afresh, the environment's included; None changes nothing."""
+        super().set_random_seed(seed)
+        if seed is not None:
+            self.seed, self.seeds_environment = seed, True
+            self.generators = split_seed(seed, self.device)
+
+    def add_transitions(self, data: Logged, *, scaled_actions: bool | None = None) -> None:
+        """Learn from logged transitions too; with some, no random episode is played.
+
+        They count as transitions for ``learning_starts``, but not as timesteps. Training on them is done when `learn`
+        begins its next episode.
+
+        Args:
+            data: an SB3 `ReplayBuffer` or `DictReplayBuffer`, a Minari dataset, or a mapping of arrays, steps first:
+                "observation" [n, S], "action" [n, A], "next_observation" [n, S], "reward" [n] and "terminated" [n]
+                (if it is left out, none was). Dict observations are dicts of such. Of a buffer with
+                ``optimize_memory_usage`` the last steps of episodes are left out: it does not keep what they led to.
+            scaled_actions: whether actions are given in [-1, 1] whatever the action space, as SB3's algorithms keep
+                them in their buffers. None: so it is in a `ReplayBuffer`, and in nothing else.
+
+        Raises:
+            EnvironmentDataError: a shape, a number that is not finite, or an action out of bounds. Nothing is stored.
+            TypeError: the data are none of these.
+        """
+        self.collector.add_logged(read_logged(data, scaled_actions, self.observation_space, self.action_space))
+
+    # ---------------------------------------------------------------------------------------------------- learning
 
     def learn(
         self: SelfAgent,
@@ -155,23 +505,50 @@ class MPCAgent(ActingAgent):
         """
         if self.env is None:
             raise ValueError("the agent has no environment to learn in: pass env=... to load, or call set_env(env)")
-        if run_folder is None and (resume or checkpoint_every is not None):
-            raise ValueError("resume and checkpoint_every need a run_folder")
-        guard: AbstractContextManager[Safeguard | None] = nullcontext()
-        if run_folder is not None:
-            guard = Safeguard(self, run_folder, resume=resume, checkpoint_every=checkpoint_every)
-        with guard as self._safeguard:
-            if self._safeguard is not None and self._safeguard.goes_on:
+        with safeguard(self, run_folder, resume=resume, checkpoint_every=checkpoint_every) as guard:
+            if guard.goes_on:
                 total_timesteps -= self.num_timesteps if resume else 0
                 reset_num_timesteps = False
-                self._safeguard.continue_logs()
-            total_timesteps, callback = self._setup_learn(
-                max(total_timesteps, 0), callback, reset_num_timesteps, tb_log_name, progress_bar
+            total_timesteps, callback = self._begin(
+                guard, max(total_timesteps, 0), callback, reset_num_timesteps, tb_log_name, progress_bar
             )
+            self._training_context = guard.training
             callback.on_training_start(locals(), globals())
-            self._control(total_timesteps, callback, log_interval)
+            try:
+                self._control(total_timesteps, callback, log_interval)
+            finally:
+                self._training_context = nullcontext
             callback.on_training_end()
         return self
+
+    def _begin(
+        self,
+        guard: Guard,
+        total_timesteps: int,
+        callback: MaybeCallback,
+        reset_num_timesteps: bool,
+        tb_log_name: str,
+        progress_bar: bool,
+    ) -> tuple[int, BaseCallback]:
+        """SB3's `_setup_learn`, with the guard's first checkpoint before there is a logger."""
+        if not reset_num_timesteps:
+            self.logs.keep_waiting()
+        # The logger comes last, and SB3 makes none where there is one of the user's.
+        makes_logger, self._custom_logger = not self._custom_logger, True
+        try:
+            total_timesteps, _ = self._setup_learn(total_timesteps, None, reset_num_timesteps, tb_log_name)
+        finally:
+            self._custom_logger = not makes_logger
+        guard.begin(tb_log_name)
+        if makes_logger:
+            self._logger = self.logs.open(tb_log_name, begin_anew=reset_num_timesteps, in_run=guard.is_on)
+        self.logs.hand_over(self.logger)
+        if self.verbose >= 1 and not self._has_described:
+            print(self.task.describe(), flush=True)
+            self._has_described = True
+        # Callbacks come last, for they may use the logger as soon as they are given the agent; the guard's after the
+        # user's, so that a checkpoint holds what they did.
+        return total_timesteps, self._init_callback([*_as_callbacks(callback), guard.callback()], progress_bar)
 
     def _control(self, total_timesteps: int, callback: BaseCallback, log_interval: int) -> None:
         """Algorithm 2 of the paper, one pass through the loop per control step (of all environments)."""
@@ -185,16 +562,17 @@ class MPCAgent(ActingAgent):
             observations = self._observations
             if self.is_exploring:
                 self._warn_of_an_endless_beginning()
-                actions = np.stack([self.planning.uniform(self.generators.exploration) for _ in self._running])
+                exploration = self.generators.exploration
+                actions = np.stack([self.controller.uniform(exploration) for _ in range(self.n_envs)])
             else:
                 actions = self._plan(observations)
 
             # Perform the first action of the sequence, append the observed tuple to the data set.
-            rewards, dones, infos = self._perform_and_append(observations, actions)
+            new_obs, rewards, dones, infos = self._perform(observations, actions)
 
             # Re-sample the inducing outputs U.
             if self.is_fitted:
-                metrics = self.dynamics.resample(self.modelled.transitions(self.store), self.generators.fit)
+                metrics = self.dynamics.resample(self.task.transitions(self.store), self.generators.fit)
                 for name, value in metrics.items():
                     self.logger.record_mean(f"train/{name}", float(value))
 
@@ -204,16 +582,52 @@ class MPCAgent(ActingAgent):
                 self._end_episode(int(index), callback, log_interval)
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
             callback.update_locals(locals())
-            goes_on = callback.on_step()
-            if self._safeguard is not None:
-                self._safeguard.after_step(episode_ended=bool(np.any(dones)))
-            if not goes_on:
+            if not callback.on_step():
                 return
         self._fit_if_due()
 
+    def _plan(self, observations: np.ndarray) -> np.ndarray:
+        """The next actions [n, A] of the running episodes' plans, which are made anew when they are used up.
+
+        Each environment is planned for by itself, in worlds that all plans of one moment share.
+        """
+        generator, actions = self.generators.planning, []
+        worlds = self.controller.worlds(generator)
+        for running, observation in zip(self.collector.running, observations, strict=True):
+            acted = self.controller.act(self.task, observation, running.carried, generator, worlds)
+            running.carried = acted.carried
+            if acted.info is not None:
+                running.record.add_plan(acted.info, acted.seconds, late=acted.late)
+            actions.append(acted.action)
+        return np.stack(actions)
+
+    def _perform(
+        self, observations: np.ndarray, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Step the environments and store what they did; a step counts only once it is stored."""
+        assert self.env is not None
+        # Until the step is stored there is no observation to go on from: after an error, learn begins a new episode.
+        self._last_obs, before = None, len(self.store)
+        try:
+            new_obs, rewards, dones, infos, terminated = self.collector.step(
+                self.env, observations, actions, self.num_timesteps
+            )
+        except EnvironmentFailedError:
+            self._episode_num += len(self.store) > before  # the step ended the episode, and the reset after it failed
+            raise
+        finally:
+            self.num_timesteps += len(self.store) - before
+        self._last_obs, self._last_episode_starts = new_obs, dones
+        if terminated.any() and self.task.functions.terminated_fn is None and not self.task.learns_termination:
+            self._warn_once(
+                "the environment ended an episode by termination, which the planner knows nothing of: pass "
+                "terminated_fn=..., or give the environment an attribute of that name"
+            )
+        return new_obs, rewards, dones, infos
+
     def _warn_of_an_endless_beginning(self) -> None:
-        has_ended = any(running.has_explored for running in self._running)
-        if self.learning_starts is None and len(self.store) == ENDLESS * self.n_envs and not has_ended:
+        is_late = len(self.store) == ENDLESS * self.n_envs and not self.collector.any_explored
+        if self.learning_starts is None and is_late:
             self._warn_once(
                 f"after {ENDLESS} random steps no episode has ended, and nothing is learned before one does: give the "
                 "environment a time limit (gymnasium.wrappers.TimeLimit), or pass learning_starts=... and, if episodes "
@@ -229,24 +643,22 @@ class MPCAgent(ActingAgent):
                 f"after {self.num_timesteps} steps: the environment's reset returned an observation that is not "
                 f"finite: {received}"
             )
-        running = self._running[index]
-        running.carried = self.planning.cold
-        running.record = EpisodeRecord(self._episode_num + 1, self.planning.horizon)
-        running.index = next_episode(self.store, [other for other in self._running if other is not running])
+        self.collector.begin_episode(index, self._episode_num + 1)
         callback.on_rollout_start()
 
     def _fit_if_due(self) -> None:
         """Train if an episode ended (or enough was seen since the last time), or exploration did."""
         if not self.is_training_due:
             return
+        task = self.task
         if not self.is_fitted:
-            for disagreement in disagreements(self.task, self.store, self.device):
+            for disagreement in disagreements(task.functions, self.store, self.device):
                 self._warn_once(disagreement)
-        if self.learns_termination and not self.modelled.terminated and self.store.terminated.any():
-            self.new_model(reward=self.modelled.reward, terminated=True)
+        if task.learns_termination and not task.modelled.terminated and self.store.terminated.any():
+            self._model_anew(reward=task.modelled.reward, terminated=True)
         started = time.perf_counter()
-        with nullcontext() if self._safeguard is None else self._safeguard.training():
-            metrics = dict(self.dynamics.fit(self.modelled.transitions(self.store), self.generators.fit))
+        with self._training_context():
+            metrics = dict(self.dynamics.fit(task.transitions(self.store), self.generators.fit))
         self.num_fitted = len(self.store)
         metrics |= {"num_transitions": self.num_fitted, "seconds": time.perf_counter() - started}
         for name, value in metrics.items():
@@ -254,52 +666,242 @@ class MPCAgent(ActingAgent):
 
     def _end_episode(self, index: int, callback: BaseCallback, log_interval: int) -> None:
         """Count, log and print what happened."""
-        running = self._running[index]
-        running.has_explored = True
         self._episode_num += 1
-        running.record.number = self._episode_num
+        record = self.collector.end_episode(index, self._episode_num)
         if self.verbose >= 1:
-            print(running.record.line(self.num_timesteps), flush=True)
-        for name, value in running.record.metrics().items():
+            print(record.line(self.num_timesteps), flush=True)
+        for name, value in record.metrics().items():
             self.logger.record(name, value)
         if log_interval is not None and self._episode_num % log_interval == 0:
             self.dump_logs()
         callback.on_rollout_end()
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "MPC",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        if not reset_num_timesteps:
-            self._pending_logs = pending_logs(self)  # the next logger is given what this one has not written
-        # The logger comes last, and SB3 makes none where there is one of the user's.
-        makes_logger, self._custom_logger = not self._custom_logger, True
-        try:
-            total_timesteps, _ = super()._setup_learn(total_timesteps, None, reset_num_timesteps, tb_log_name)
-        finally:
-            self._custom_logger = not makes_logger
-        if self._safeguard is not None:
-            self._safeguard.begin(tb_log_name)
-        if makes_logger:
-            self._logger = self._new_logger(tb_log_name, reset_num_timesteps)
-        for name, value, count, excluded in self._pending_logs:
-            self.logger.record(name, value, tuple(excluded or ()))
-            self.logger.name_to_count[name] = count
-        self._pending_logs = []
-        if self.verbose >= 1 and not self._has_described:
-            print(self.task.describe(can_learn_termination=self.learns_termination), flush=True)
-            self._has_described = True
-        # Callbacks come last, for they may use the logger as soon as they are given the agent.
-        return total_timesteps, self._init_callback(callback, progress_bar)
+    @property
+    def _observations(self) -> np.ndarray:
+        """The present observations, [n, S]."""
+        assert self._last_obs is not None
+        return self._last_obs
 
-    def _new_logger(self, tb_log_name: str, reset_num_timesteps: bool) -> Logger:
-        """SB3's, in the folder of the run if there is one, else in the next or the newest of that name."""
-        verbose = max(self.verbose - 1, 0)  # SB3 prints its tables at verbose=1; here that level is a line per episode
-        if self._safeguard is None or self.tensorboard_log is None or self._log_run is None:
-            return configure_logger(verbose, self.tensorboard_log, tb_log_name, reset_num_timesteps)
-        formats = ["stdout", "tensorboard"] if verbose else ["tensorboard"]
-        return configure(os.path.join(self.tensorboard_log, self._log_run), formats)
+    @property
+    def _starts(self) -> np.ndarray:
+        """In which environments the present observation is the first of an episode, [n]."""
+        assert self._last_episode_starts is not None
+        return self._last_episode_starts
+
+    def dump_logs(self) -> None:
+        """Write what was recorded since the last time, with running means and speed."""
+        elapsed = max((time.time_ns() - self.start_time) / 1e9, 1e-9)
+        self.logger.record("time/episodes", self._episode_num, exclude="tensorboard")
+        self.logger.record("time/fps", (self.num_timesteps - self._num_timesteps_at_start) / elapsed)
+        self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logs.record_means(self.logger)
+        self.logger.dump(step=self.num_timesteps)
+
+    def _warn_once(self, message: str) -> None:
+        if message not in self._warned:
+            self._warned.add(message)
+            warnings.warn(message, stacklevel=3)
+
+    # -------------------------------------------------------------------------------------------------- predicting
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: PackedPlans | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, PackedPlans]:
+        """Plan, and return the action and the plan to pass to the next call.
+
+        Leaves learning untouched: nothing that training draws from or trains is moved. With a ``time_budget`` the plan
+        is the best that was found in that time; a plan that took longer all the same is counted in `num_late_plans`,
+        and the first one warns.
+
+        Args:
+            observation: [S], or [n, S] of n environments; or a dict of such, if the environment's are.
+            state: what the last call returned; None plans from scratch.
+            episode_start: [n], true where a new episode begins and the state is to be forgotten.
+            deterministic: draw worlds and candidates from a generator that depends on the agent's seed and on the
+                observation alone, so that the same observation and state give the same action. Otherwise from a
+                generator that moves on with every call.
+
+        Returns:
+            The action (or n of them), in the action space's shape and dtype, and the state: what the planner carries,
+            as arrays [n, ...], and the age [n] of the plans. (CEM carries mean [n, H, A] and standard deviation
+            [n, H, A].) An agent that has not learned yet warns once and returns the middle of the action range, or
+            uniformly random actions unless ``deterministic``.
+
+        Raises:
+            ValueError: observation or state has the wrong shape, or a dict other parts than the environment's.
+            EnvironmentDataError: the observation is not finite.
+            UnknownRewardError: the agent was loaded without an environment and without a reward function.
+            PlanningError: no candidate plan had a finite return.
+        """
+        return self.policy.predict(observation, state, episode_start, deterministic)
+
+    # --------------------------------------------------------------------------------------------- saving and loading
+
+    def save(
+        self,
+        path: CheckpointPath,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Save everything needed to predict and to learn on: see `checkpoints.collect` for what that is.
+
+        Args:
+            path: file (".zip" is added if it has no suffix), replaced only by a complete one; or a binary file object.
+            exclude, include: of SB3's signature; without effect.
+
+        Raises:
+            CheckpointWriteError: the file cannot be written, or is more than `load` would read; the old one is whole.
+                It is an OSError too.
+        """
+        write_checkpoint(collect(self), path)
+
+    @classmethod
+    def load(
+        cls: type[SelfAgent],
+        path: CheckpointPath,
+        env: GymEnv | str | None = None,
+        device: torch.device | str = "cpu",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfAgent:
+        """Make an agent from a saved file; no code in the file is run.
+
+        Args:
+            path: what `save` was given.
+            env: the environment to go on in, or its id; None serves prediction, and then a reward that was not learned
+                must be given, and the termination function if the environment offered one.
+            device: where planning computes. On another kind than the agent was saved on, new random streams begin.
+            custom_objects: of SB3's signature; without effect, since nothing is unpickled.
+            print_system_info: print versions of this system.
+            force_reset: begin a new episode when learning goes on; False continues the one that was running, for an
+                ``env`` that is still in it.
+            kwargs: arguments of the constructor in place of the saved ones: ``reward_fn`` and ``terminated_fn`` if
+                they were given to the agent that was saved, a ``planner`` that was not given by name, ``dynamics`` of
+                a plain `MPCAgent`, ``verbose``, ``tensorboard_log`` and so on. With ``seed`` the random streams begin
+                afresh, the environment's included; with another planner or horizon, or fewer actions per plan, the
+                plan does.
+
+        Warns:
+            UserWarning: the saved agent planned with a termination function, and there is none now (without an
+                environment, `predict` says so).
+            ReliabilityWarning: it was saved on another kind of device.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            CheckpointError: it is not an agent's file, is damaged or from a newer version, or does not fit ``env``.
+            UnknownRewardError: ``env`` offers no reward function and none was given.
+        """
+        if print_system_info:
+            get_system_info()
+        return load_agent(cls, path, env, device, force_reset, kwargs)
+
+    def get_parameters(self) -> dict[str, dict]:
+        """The learned state of the dynamics model, by SB3's name for such things."""
+        return {"dynamics": self.dynamics.state_dict()}
+
+    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+        """Not offered, because SB3's own would unpickle the file: use `load`.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(f"to take over what another agent has learned use {type(self).__name__}.load(path)")
+
+    @classmethod
+    def saved_settings(cls, planner: str | PlannerFactory | Planner) -> dict[str, Setting]:
+        """The constructor arguments that a file holds, of an agent with this planner."""
+        together = joined(cls.own_settings(), cls.part_settings(planner))
+        return {name: setting for name, setting in together.items() if setting.is_saved}
+
+    @property
+    def planner_name(self) -> str | None:
+        """The registered name that the planner was given by; None if it was given as a class or an object."""
+        return self._planner_given if isinstance(self._planner_given, str) else None
+
+    def arguments(self) -> dict[str, Any]:
+        """The constructor arguments as they are now, those that a file holds."""
+        own = {name: getattr(self, name) for name in self.own_settings()}
+        saved = self.saved_settings(self._planner_given)
+        return {"planner": self.planner_name} | {name: {**self.settings, **own}[name] for name in saved}
+
+    def nouns(self) -> dict[str, Stateful]:
+        """What a checkpoint holds, in the order in which it is restored; each knows its own fields."""
+        return {
+            "task": StateOf(self.task.state_dict, self._load_task),
+            "dynamics": self.dynamics,
+            "transitions": self.store,
+            "progress": StateOf(self._progress, self._load_progress),
+            "random": StateOf(self._random, self._load_random),
+            "logs": self.logs,
+            "episodes": self.collector,
+        }
+
+    def _load_task(self, state: StateDict) -> None:
+        before = self.task.modelled
+        self.task.load_state_dict(state)
+        if self.task.modelled != before:
+            self.controller.dynamics = self._new_dynamics()
+
+    def _progress(self) -> StateDict:
+        """Counters, and where the environments are if an episode is running in them."""
+        state: StateDict = {"num_timesteps": self.num_timesteps, "num_fitted": self.num_fitted}
+        state["num_episodes"] = self._episode_num
+        if self._last_obs is not None:
+            state["last_observation"] = torch.tensor(self._last_obs)
+            state["last_episode_starts"] = torch.tensor(self._last_episode_starts)
+        return state
+
+    def _load_progress(self, state: StateDict) -> None:
+        counts = {name: state[name] for name in ("num_timesteps", "num_fitted", "num_episodes")}
+        for name, count in counts.items():
+            if not isinstance(count, int) or isinstance(count, bool) or not 0 <= count <= LARGEST_COUNT:
+                raise ValueError(f"{name} must be a count from 0 to {LARGEST_COUNT}, got {count!r}")
+        self.num_timesteps, self.num_fitted, self._episode_num = counts.values()
+        self._last_obs = None
+        if "last_observation" in state and len(state["last_observation"]) == self.n_envs:
+            self.begin_at(state["last_observation"].numpy(), state["last_episode_starts"].numpy())
+
+    def begin_at(self, observation: np.ndarray | None, episode_starts: np.ndarray | None = None) -> None:
+        """Let `learn` go on from these observations [n, S]; None lets it begin new episodes."""
+        self._last_obs = observation
+        if observation is not None:
+            self._last_episode_starts = episode_starts
+
+    def _random(self) -> StateDict:
+        """The random streams, which belong to a kind of device."""
+        return {
+            "device": self.device.type, "seeds_environment": self.seeds_environment, **self.generators.state_dict()
+        }  # fmt: skip
+
+    def _load_random(self, state: StateDict) -> None:
+        self.seeds_environment = bool(state["seeds_environment"])
+        saved_on, device = state.get("device", self.device.type), self.device.type
+        if saved_on == device:
+            self.generators.load_state_dict(state)
+            return
+        warnings.warn(
+            f"the agent was saved on the device {saved_on!r}, whose random numbers {device!r} cannot go on with: it "
+            "begins new ones, and goes on otherwise than it would have there",
+            ReliabilityWarning,
+            stacklevel=2,
+        )
+        self.generators = split_seed(derive_seed(self.seed, "other_device", self.num_timesteps), self.device)
+
+
+def _property(name: str) -> property:
+    """A setting, to be read on the agent; it is decided when the agent is made."""
+    return property(lambda agent: agent._setting(name))
+
+
+def _as_callbacks(callback: MaybeCallback) -> list[BaseCallback]:
+    """What `learn` was given, as SB3's callbacks."""
+    if isinstance(callback, list):
+        return callback
+    return [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]

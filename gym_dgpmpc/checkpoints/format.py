@@ -22,18 +22,24 @@ from torch import Tensor
 
 from gym_dgpmpc.checkpoints.files import replace_file
 from gym_dgpmpc.checkpoints.reading import UnsafeFileError, check_members, open_members, parse_json, parse_tensors
+from gym_dgpmpc.checkpoints.upgrade import upgraded
 from gym_dgpmpc.errors import CheckpointError, CheckpointWriteError
 
 FORMAT = "gym_dgpmpc agent"
-SCHEMA = 4
-"""1: without what a running episode needs to go on. 2: of one environment, whose reward was not learned. Either is
-without the arguments added since (see `saving.py`). 3: with the episodes that logged means are over as plain values."""
+SCHEMA = 5
+"""`upgrade.py` has the older ones. A field that is added needs no new number: its noun reads older files."""
 
 CheckpointPath = str | os.PathLike[str] | IO[bytes] | io.BufferedIOBase
 
 
 class Checkpoint(NamedTuple):
-    """What a file holds: plain values, and the tensors of each part by name; and the schema it had, if it was read."""
+    """What a file holds, in the layout of the present schema.
+
+    Attributes:
+        config: plain values; those of each noun under "values".
+        tensors: of each noun, and of "spaces".
+        schema: that the file had, if it was read.
+    """
 
     config: dict[str, Any]
     tensors: dict[str, dict[str, Tensor]]
@@ -142,9 +148,11 @@ def _read(file: IO[bytes] | io.BufferedIOBase, where: str) -> Checkpoint:
         if table[name] != {"bytes": len(data), "sha256": _sha256(data)}:
             raise CheckpointError(f"{where} is damaged: the checksum of {name!r} does not match")
     config = _json(members.pop("config.json"), "config.json", where)
-    return Checkpoint(
-        config, {_part(name, where): _tensors(data, name, where) for name, data in members.items()}, schema
-    )
+    tensors = {_part(name, where): _tensors(data, name, where) for name, data in members.items()}
+    try:
+        return Checkpoint(*upgraded(config, tensors, schema), schema)
+    except Exception as error:  # whatever a file that was made by hand lacks
+        raise CheckpointError(f"{where} is damaged: it is not laid out as schema {schema} is: {error!r}") from error
 
 
 def _part(name: str, where: str) -> str:

@@ -6,20 +6,20 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from gym_dgpmpc.checkpoints.collect import encode, to_learn
+from gym_dgpmpc.checkpoints.arguments import encode, saved_arguments
 from gym_dgpmpc.checkpoints.format import Checkpoint
-from gym_dgpmpc.checkpoints.restore import restore
-from gym_dgpmpc.checkpoints.saved import saved_arguments, saved_running, saved_spaces
+from gym_dgpmpc.checkpoints.interface import Checkpointed, running_episode
+from gym_dgpmpc.checkpoints.restore import about_environment, restore, saved_num_envs, saved_spaces, saved_state
 from gym_dgpmpc.errors import CheckpointError, ReliabilityWarning
 from gym_dgpmpc.randomness import derive_seed
+from gym_dgpmpc.tasks.environment import environment_id
 from gym_dgpmpc.tasks.replay import replay, return_to_start, set_options, set_present_generators
-from gym_dgpmpc.tasks.task import environment_id
 
 MAY_DIFFER = {"verbose", "tensorboard_log", "stats_window_size", "time_budget"}
 """Arguments that a run may go on with other values of."""
 
 
-def resume_agent(agent: Any, checkpoint: Checkpoint) -> None:
+def resume_agent(agent: Checkpointed, checkpoint: Checkpoint) -> None:
     """Put everything of a checkpoint into an agent that was made as the one that wrote it, and its environment back.
 
     The running episode goes on where it was: its beginning is drawn again, and, in a simulator, its actions are
@@ -34,15 +34,16 @@ def resume_agent(agent: Any, checkpoint: Checkpoint) -> None:
             what.
     """
     _refuse_another(agent, checkpoint)
-    restore(agent, checkpoint)
-    _ = agent.task  # an error if the reward that was given is missing
     agent.seed = checkpoint.config["arguments"]["seed"]
-    agent._last_obs = None
+    restore(agent, checkpoint)
+    _ = agent.task.functions  # an error if the reward that was given is missing
+    agent.begin_at(None)
+    assert agent.env is not None
     episode = checkpoint.config.get("episode")
     if episode is None:
         if agent.seeds_environment:
             agent.env.seed(derive_seed(agent.seed, "environment", agent.num_timesteps))
-        set_options(agent.env, checkpoint.config.get("reset_options"))
+        set_options(agent.env, about_environment(checkpoint).get("reset_options"))
         return
     try:
         if episode["goes_on"] and (episode["num_steps"] == 0 or episode["can_replay"]):
@@ -55,13 +56,14 @@ def resume_agent(agent: Any, checkpoint: Checkpoint) -> None:
         raise CheckpointError(f"the checkpoint does not say how its episode began: {error!r}") from error
 
 
-def _continue_episode(agent: Any, checkpoint: Checkpoint, episode: dict[str, Any]) -> None:
+def _continue_episode(agent: Checkpointed, checkpoint: Checkpoint, episode: dict[str, Any]) -> None:
     """Begin the episode again and repeat its actions; on a difference, warn and let a new one begin."""
-    rows = np.flatnonzero(agent.store.episodes.numpy() == agent._running[0].index)
+    rows = np.flatnonzero(agent.store.episodes.numpy() == running_episode(agent))
     rows = rows[len(rows) - episode["num_steps"] :] if episode["num_steps"] else rows[:0]
-    last = checkpoint.tensors["agent"]["last_observation"].numpy()
+    last = checkpoint.tensors["progress"]["last_observation"].numpy()
     data = agent.store.transitions()
     first = data.observation[rows[0]].numpy() if len(rows) else last[0].astype(np.float32)
+    assert agent.env is not None
     begun = return_to_start(agent.env, episode)
     observation: ndarray | str = begun
     if len(rows) != episode["num_steps"]:
@@ -81,29 +83,30 @@ def _continue_episode(agent: Any, checkpoint: Checkpoint, episode: dict[str, Any
         if len(rows):
             return  # `learn` resets
         observation = begun
-    agent._last_obs = observation
-    agent._last_episode_starts = np.array([len(rows) == 0])
+    agent.begin_at(observation, np.array([len(rows) == 0]))
 
 
-def _refuse_another(agent: Any, checkpoint: Checkpoint) -> None:
+def _refuse_another(agent: Checkpointed, checkpoint: Checkpoint) -> None:
     name = checkpoint.config.get("class")
     if name != type(agent).__name__:
         raise CheckpointError(f"the checkpoint is of a {name}, the agent is a {type(agent).__name__}")
-    saved = saved_arguments(checkpoint, type(agent))
+    saved, present = saved_arguments(checkpoint, type(agent)), agent.arguments()
     given_seed = {"seed"} if agent.seeds_environment else set()
     differing = [
-        f"{name} was {saved[name]}, now {getattr(agent, name)}"
-        for name in sorted(set(checkpoint.config["arguments"]) - MAY_DIFFER - ({"seed"} - given_seed))
-        if encode(saved[name]) != encode(getattr(agent, name))
+        f"{name} was {saved[name]}, now {present.get(name)}"
+        for name in sorted(set(saved) - MAY_DIFFER - ({"seed"} - given_seed))
+        if encode(saved[name]) != encode(present.get(name))
     ]
-    if checkpoint.config.get("to_learn", to_learn(agent)) != to_learn(agent):
-        differing.append(f"what was to be learned was {checkpoint.config['to_learn']}, now {to_learn(agent)}")
-    if len(saved_running(checkpoint)) != agent.n_envs:
-        differing.append(f"it had {len(saved_running(checkpoint))} environments, now {agent.n_envs}")
+    to_learn = saved_state(checkpoint, "task").get("to_learn", agent.task.to_learn)
+    if to_learn != agent.task.to_learn:
+        differing.append(f"what was to be learned was {to_learn}, now {agent.task.to_learn}")
+    num_envs = saved_num_envs(checkpoint)
+    if num_envs != agent.n_envs:
+        differing.append(f"it had {num_envs} environments, now {agent.n_envs}")
     both = agent.observation_space, agent.action_space
     if saved_spaces(checkpoint) != both:
         differing.append(f"its spaces were {saved_spaces(checkpoint)}, now {both}")
-    ids = checkpoint.config.get("environment"), environment_id(agent.env)
+    ids = about_environment(checkpoint).get("environment"), environment_id(agent.env)
     # One that is not registered has no id; older files lack the module that registers Gymnasium-Robotics' ones.
     if None not in ids and len({str(each).rpartition(":")[-1] for each in ids}) > 1:
         differing.append(f"the environment was {ids[0]}, now {ids[1]}")

@@ -2,28 +2,91 @@
 
 import os
 import warnings
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Protocol, runtime_checkable
 
-from stable_baselines3.common.utils import get_latest_run_id
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
 
 from gym_dgpmpc.checkpoints.collect import collect
 from gym_dgpmpc.checkpoints.event_files import drop_events_after
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
+from gym_dgpmpc.checkpoints.interface import Checkpointed
 from gym_dgpmpc.checkpoints.resume import resume_agent
 from gym_dgpmpc.checkpoints.signals import StopRequests
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import CheckpointError, ReliabilityWarning
 
 
+@runtime_checkable
+class Guard(Protocol):
+    """What `MPCAgent.learn` asks of what stands around it."""
+
+    @property
+    def is_on(self) -> bool:
+        """Whether there is a run's folder."""
+        ...
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the folder held a run, which the agent goes on with."""
+        ...
+
+    def begin(self, tb_log_name: str) -> None:
+        """The environments are reset; the next thing is the logger."""
+        ...
+
+    def callback(self) -> BaseCallback:
+        """To be called after each step, behind the user's callbacks."""
+        ...
+
+    def training(self) -> AbstractContextManager[None]:
+        """Around each training."""
+        ...
+
+
+class Unguarded:
+    """A `Guard` of a call without a run's folder: nothing is written, and signals do what they always do."""
+
+    is_on = goes_on = False
+
+    def begin(self, tb_log_name: str) -> None:
+        """Nothing to do."""
+
+    def callback(self) -> BaseCallback:
+        return _AfterEachStep(lambda *, episode_ended: None)
+
+    def training(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+
+def safeguard(
+    agent: Checkpointed,
+    run_folder: str | os.PathLike[str] | RunCheckpoints | None,
+    *,
+    resume: bool,
+    checkpoint_every: int | None,
+) -> "AbstractContextManager[Guard]":
+    """What stands around one call of `MPCAgent.learn`: a `Safeguard` if there is a folder, else an `Unguarded`.
+
+    Raises:
+        ValueError: there is no folder to resume from or to write to; or see `Safeguard`.
+    """
+    if run_folder is not None:
+        return Safeguard(agent, run_folder, resume=resume, checkpoint_every=checkpoint_every)
+    if resume or checkpoint_every is not None:
+        raise ValueError("resume and checkpoint_every need a run_folder")
+    return nullcontext(Unguarded())
+
+
 class Safeguard:
     """A context around one call of `MPCAgent.learn` with a run's folder.
 
     On entering, the folder is taken hold of, and the agent goes on from it if it should. Inside, `begin` writes a first
-    checkpoint, so that a run killed within its first episode is known to be one; `after_step` writes checkpoints and
+    checkpoint, so that a run killed within its first episode is known to be one; `callback` writes checkpoints and
     heeds requests to stop; `training` is around each training. On an exception everything gathered so far is written,
     unless the run never began.
 
@@ -42,7 +105,7 @@ class Safeguard:
 
     def __init__(
         self,
-        agent: Any,
+        agent: Checkpointed,
         run_folder: str | os.PathLike[str] | RunCheckpoints,
         *,
         resume: bool,
@@ -69,6 +132,8 @@ class Safeguard:
             if self.resume:
                 resume_from(self.agent, self.checkpoints)
             self._goes_on = self.checkpoints.exist
+            if self._goes_on:
+                self._continue_logs()
             stack.enter_context(self.stop)
             self._stack = stack.pop_all()
         return self
@@ -90,6 +155,8 @@ class Safeguard:
                         f"no checkpoint could be written after that error: {another}", ReliabilityWarning, stacklevel=2
                     )
 
+    is_on = True
+
     @property
     def goes_on(self) -> bool:
         """Whether the folder held a run, which the agent goes on with."""
@@ -99,15 +166,18 @@ class Safeguard:
         """Choose where a new run logs, and write its first checkpoint, which says so before there is such a folder."""
         if self._goes_on:
             return
-        if self.agent.tensorboard_log is not None:
-            newest = get_latest_run_id(self.agent.tensorboard_log, tb_log_name)
-            self.agent._log_run = f"{tb_log_name}_{newest + 1}"
+        self.agent.logs.choose_run(tb_log_name)
         self._save()
 
-    def continue_logs(self) -> None:
+    def callback(self) -> BaseCallback:
+        """Calls `after_step`, as the last of all callbacks."""
+        return _AfterEachStep(self.after_step)
+
+    def _continue_logs(self) -> None:
         """Drop what was logged after the checkpoint, for it will be logged again; see `event_files`."""
-        if self.agent.tensorboard_log is not None and self.agent._log_run is not None:
-            drop_events_after(self.agent.num_timesteps, Path(self.agent.tensorboard_log) / self.agent._log_run)
+        folder, run = self.agent.tensorboard_log, self.agent.logs.run
+        if folder is not None and run is not None:
+            drop_events_after(self.agent.num_timesteps, Path(folder) / run)
 
     @contextmanager
     def training(self) -> Iterator[None]:
@@ -151,7 +221,19 @@ class Safeguard:
         return self.agent.num_timesteps, self.agent.num_fitted
 
 
-def resume_from(agent: Any, checkpoints: RunCheckpoints) -> bool:
+class _AfterEachStep(BaseCallback):
+    """Says, after each step of all environments, whether an episode has ended."""
+
+    def __init__(self, after_step: Callable[..., None]):
+        super().__init__()
+        self._after_step = after_step
+
+    def _on_step(self) -> bool:
+        self._after_step(episode_ended=bool(np.any(self.locals["dones"])))
+        return True
+
+
+def resume_from(agent: Checkpointed, checkpoints: RunCheckpoints) -> bool:
     """Go on from the newest checkpoint that is whole; False if there is none.
 
     Raises:

@@ -1,7 +1,7 @@
 """Moving-window Monte Carlo EM: SG-HMC over inducing outputs, Adam over hyperparameters, interleaved.
 
-Works on one batch of standardised inputs and targets; `training.py` decides how long, `dynamics/deep_gp/model.py` prepares
-the data and keeps the results. The E-step is one SG-HMC step; the M-step is one Adam step on the hyperparameters,
+Works on one batch of standardised inputs and targets; `training.py` decides how long, `dynamics/deep_gp/` prepares the
+data and keeps the results. The E-step is one SG-HMC step; the M-step is one Adam step on the hyperparameters,
 inducing inputs and noise under a sample drawn uniformly from the window of the latest SG-HMC positions (Havasi et al.
 2018, algorithm 1). Now and then the last layer is drawn exactly (`last_layer.py`), which is not in the paper.
 """

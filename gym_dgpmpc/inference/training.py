@@ -1,7 +1,7 @@
 """How long to train, and what to do when training goes wrong: the loop around `mcem.MCEM.step`.
 
 Every so many iterations it looks at the run. If the run has diverged, it goes back to the last look with half the step
-size. If the likelihood of held-out data no longer improves, it stops. `dynamics/deep_gp/model.py` calls it once per fit.
+size. If the likelihood of held-out data no longer improves, it stops. `dynamics/deep_gp/` calls it once per fit.
 """
 
 import math

@@ -66,10 +66,10 @@ class Controller:
         dynamics: DynamicsModel,
         planner: Planner,
         action_space: spaces.Box,
-        *,
         num_particles: int = 5,
         actions_per_plan: int = 1,
         time_budget: float | None = None,
+        *,
         device: torch.device | str = "cpu",
     ):
         self.dynamics, self.planner, self.device = dynamics, planner, torch.device(device)
@@ -141,8 +141,8 @@ class Controller:
         worlds is part of the budget; a plan that was late all the same is counted.
 
         Args:
-            task: the reward and termination to plan with, as functions of what the model predicts.
-            observation: [S_all], as the model sees it (see `modelled.py`).
+            task: what to plan for, and how the model sees an observation.
+            observation: [S].
             carried: what the last step of the same episode returned, or `cold`.
             generator: for the worlds and the planner.
             worlds: of `worlds`; None draws some for this plan alone.
@@ -159,9 +159,10 @@ class Controller:
         if age == 0:
             deadline = None if self.time_budget is None else started + self.time_budget
             drawn = self.worlds(generator)() if worlds is None else worlds()
-            start = torch.as_tensor(observation, dtype=torch.float32, device=self.device)
-            assert task.reward_fn is not None
-            objective = rollout_objective(drawn, task.reward_fn, start, self.num_particles, task.terminated_fn)
+            start = torch.as_tensor(task.start(observation), dtype=torch.float32, device=self.device)
+            reward_fn, terminated_fn = task.planned[:2]
+            assert reward_fn is not None
+            objective = rollout_objective(drawn, reward_fn, start, self.num_particles, terminated_fn)
             try:
                 plan, info = self.planner.plan(objective, plan, generator, deadline=deadline)
                 late = deadline is not None and time.perf_counter() > deadline

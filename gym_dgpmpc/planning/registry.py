@@ -4,7 +4,7 @@ A new planner is one line, ``register_planner("my-planner", MyPlanner)``; an age
 """
 
 import re
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch
 from gymnasium import spaces
@@ -35,7 +35,12 @@ def register_planner(name: str, factory: PlannerFactory) -> None:
         raise ValueError(f"the name {name!r} is taken by {PLANNERS[name]!r}: choose another one")
 
 
-def planner_factory(planner: str | PlannerFactory) -> PlannerFactory:
+def is_ready_made(planner: str | PlannerFactory | Planner) -> TypeGuard[Planner]:
+    """Whether it is a planner already, and nothing that makes one."""
+    return isinstance(planner, Planner) and not isinstance(planner, type)
+
+
+def planner_factory(planner: str | PlannerFactory | Planner) -> PlannerFactory:
     """The class or function that makes a planner of this name; one that is given in place of a name is returned.
 
     Raises:
@@ -69,7 +74,7 @@ def make_planner(
         ValueError: there is no planner of this name, or a setting is out of its range.
         TypeError: a setting that the planner does not have, or with a ready-made planner any.
     """
-    if isinstance(planner, Planner) and not isinstance(planner, type):
+    if is_ready_made(planner):
         if settings:
             raise TypeError(f"a ready-made planner has its settings already, got {sorted(settings)} with it")
         return planner

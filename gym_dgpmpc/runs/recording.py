@@ -111,7 +111,7 @@ class ForecastCallback(BaseCallback):
     def __init__(self, agent: MPCAgent, recorder: EpisodeRecorder, num_particles: int = NUM_FORECAST_PARTICLES):
         super().__init__()
         self.agent, self.recorder, self.num_particles = agent, recorder, num_particles
-        self.horizon = agent.planning.horizon
+        self.horizon = agent.controller.horizon
         self.forecasts: list[Forecast] = []
         """Those of the last planned episode that ended."""
         self._worlds: dict[int, TransitionSampler] = {}
@@ -132,7 +132,7 @@ class ForecastCallback(BaseCallback):
 
     def _compare(self, episode: Episode, start: int) -> Forecast:
         """What the worlds drawn at a step make of the actions that were taken from it, beside what they led to."""
-        modelled = self.agent.modelled
+        modelled = self.agent.task.modelled
         actions = episode.actions[start : start + self.horizon].reshape(1, -1, episode.actions[0].size)
         predicted = rollout(
             self._worlds[start],

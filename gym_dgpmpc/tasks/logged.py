@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
 from gym_dgpmpc.errors import EnvironmentDataError
 from gym_dgpmpc.tasks.dict_observations import flatten
-from gym_dgpmpc.tasks.task import flat_size
+from gym_dgpmpc.tasks.environment import flat_size
 
 REQUIRED = ("observation", "action", "next_observation", "reward")
 FIELDS = (*REQUIRED, "terminated")

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gym_dgpmpc.data.transitions import TransitionStore
-from gym_dgpmpc.tasks.task import Task
+from gym_dgpmpc.tasks.functions import TaskFunctions
 from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn, Transitions
 
 
@@ -94,14 +94,14 @@ class ModelledVector:
         """The vector from which a plan starts."""
         return np.pad(observation, (0, self.size - self.observation_size))
 
-    def task(self, task: Task) -> Task:
+    def functions(self, found: TaskFunctions) -> TaskFunctions:
         """The same reward and termination as functions of the vector; a function that is known goes before.
 
         Raises:
             ValueError: the reward is neither known nor predicted.
         """
         size = self.observation_size
-        reward_fn, terminated_fn = task.reward_fn, task.terminated_fn
+        reward_fn, terminated_fn = found.reward_fn, found.terminated_fn
         if reward_fn is None:
             if not self.reward:
                 raise ValueError("the reward is neither known as a function nor predicted")
@@ -110,9 +110,9 @@ class ModelledVector:
             reward_fn = _OfObservation(reward_fn, size)
         if terminated_fn is not None and self.size > size:
             terminated_fn = _EndOfObservation(terminated_fn, size)
-        elif terminated_fn is None and self.terminated and task.terminated_source == "learned":
+        elif terminated_fn is None and self.terminated and found.terminated_source == "learned":
             terminated_fn = ComponentAboveHalf(size + self.reward)
-        return task._replace(reward_fn=reward_fn, terminated_fn=terminated_fn)
+        return found._replace(reward_fn=reward_fn, terminated_fn=terminated_fn)
 
 
 @dataclass(frozen=True)

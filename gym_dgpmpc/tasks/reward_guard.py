@@ -4,26 +4,26 @@ import torch
 from torch import Tensor
 
 from gym_dgpmpc.data.transitions import TransitionStore
-from gym_dgpmpc.tasks.task import Task
+from gym_dgpmpc.tasks.functions import TaskFunctions
 
 TOLERANCE = 1e-3
 """Of the largest reward's magnitude. Stored numbers are float32, and some known rewards are exact to 3e-4 only."""
 
 
 @torch.no_grad()
-def disagreements(task: Task, store: TransitionStore, device: torch.device | str = "cpu") -> list[str]:
+def disagreements(functions: TaskFunctions, store: TransitionStore, device: torch.device | str = "cpu") -> list[str]:
     """What does not agree between a task's functions and stored transitions, in words and numbers; empty if all does.
 
     A reward that deliberately is not the one that `step` returns is not compared.
     """
     observation, action, after = (tensor.to(device) for tensor in store.transitions())
     found = []
-    if task.reward_fn is not None and task.is_reported:
-        planned, returned = task.reward_fn(observation, action, after).cpu(), store.rewards
+    if functions.reward_fn is not None and functions.is_reported:
+        planned, returned = functions.reward_fn(observation, action, after).cpu(), store.rewards
         limit = TOLERANCE * returned.abs().max().clamp(min=1e-3)
         found += _told("reward_fn", planned.to(returned.dtype), returned, ~((planned - returned).abs() <= limit))
-    if task.terminated_fn is not None:
-        planned = task.terminated_fn(after).cpu()
+    if functions.terminated_fn is not None:
+        planned = functions.terminated_fn(after).cpu()
         found += _told("terminated_fn", planned, store.terminated, planned != store.terminated)
     return found
 

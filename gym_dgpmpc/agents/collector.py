@@ -1,0 +1,234 @@
+"""The episodes that run in an agent's environments: taking steps, keeping what happened, and where each episode stands.
+
+`mpc.py` says what to do in each step; here it is done and stored.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from gym_dgpmpc.agents.episode import EpisodeRecord
+from gym_dgpmpc.data.transitions import TransitionStore
+from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
+from gym_dgpmpc.planning.controller import Controller
+from gym_dgpmpc.planning.plan_state import PlanState, plans_from_tensors, plans_to_tensors
+from gym_dgpmpc.tasks.dict_observations import flatten
+from gym_dgpmpc.tasks.logged import LoggedRows
+from gym_dgpmpc.tasks.replay import episode_start
+from gym_dgpmpc.types import StateDict
+
+MOST_ENVIRONMENTS, LARGEST_COUNT = 10_000, 1 << 53
+"""What a file may claim."""
+
+
+@dataclass
+class RunningEpisode:
+    """The episode that is running in one environment.
+
+    Attributes:
+        carried: its plan.
+        record: what happened in it so far.
+        index: its number in the store; -1 before the first one.
+        has_explored: whether an episode of random actions has ended in this environment.
+    """
+
+    carried: PlanState
+    record: EpisodeRecord
+    index: int = -1
+    has_explored: bool = False
+
+
+class Step(NamedTuple):
+    """What the environments returned, as Stable-Baselines3 has it: an ended episode's ``new_obs`` is the next one's."""
+
+    new_obs: Float[ndarray, "n S"]
+    rewards: Float[ndarray, "n"]
+    dones: Bool[ndarray, "n"]
+    infos: list[dict[str, Any]]
+    terminated: Bool[ndarray, "n"]
+
+
+class Collector:
+    """Steps the environments and stores what they do; a step counts once it is stored.
+
+    Args:
+        store: where to.
+        num_envs: n.
+        controller: whose plans the episodes carry.
+    """
+
+    def __init__(self, store: TransitionStore, num_envs: int, controller: Controller):
+        self.store, self._controller = store, controller
+        self.running = self._new_episodes(num_envs)
+
+    def _new_episodes(self, num_envs: int, *, has_explored: bool = False) -> list[RunningEpisode]:
+        cold, horizon = self._controller.cold, self._controller.horizon
+        return [RunningEpisode(cold, EpisodeRecord(1, horizon), -1, has_explored) for _ in range(num_envs)]
+
+    def resize(self, num_envs: int) -> bool:
+        """Go on in another number of environments; False if it is the same number, and nothing has changed."""
+        if num_envs == len(self.running):
+            return False
+        self.running = self._new_episodes(num_envs, has_explored=self.all_explored)
+        return True
+
+    @property
+    def records(self) -> list[EpisodeRecord]:
+        """What happened so far in each environment's running episode, or in the one that has just ended."""
+        return [running.record for running in self.running]
+
+    @property
+    def all_explored(self) -> bool:
+        """Whether an episode of random actions has ended in every environment."""
+        return all(running.has_explored for running in self.running)
+
+    @property
+    def any_explored(self) -> bool:
+        """Whether an episode of random actions has ended in any environment."""
+        return any(running.has_explored for running in self.running)
+
+    def begin_episode(self, index: int, number: int) -> None:
+        """A new episode, with a cold plan, in the environment ``index``; ``number`` is what a log calls it."""
+        running = self.running[index]
+        others = [other for other in self.running if other is not running]
+        running.carried = self._controller.cold
+        running.record = EpisodeRecord(number, self._controller.horizon)
+        running.index = next_episode(self.store, others)
+
+    def end_episode(self, index: int, number: int) -> EpisodeRecord:
+        """The record of the episode that has ended in the environment ``index``."""
+        running = self.running[index]
+        running.has_explored, running.record.number = True, number
+        return running.record
+
+    def add_logged(self, rows: LoggedRows) -> None:
+        """Store transitions that were logged elsewhere; no random episode is needed then.
+
+        Raises:
+            EnvironmentDataError: a row is not finite; nothing is stored.
+        """
+        episode = rows.episode + next_episode(self.store, self.running)
+        # First into a store of their own, whose errors count steps from the first one that is added.
+        for store in (TransitionStore(self.store.observation_size, self.store.action_size), self.store):
+            store.extend(*rows[:3], reward=rows.reward, terminated=rows.terminated, episode=episode)
+        for running in self.running:
+            running.has_explored = True
+
+    def step(self, env: VecEnv, observations: ndarray, actions: Float[ndarray, "n A"], number: int) -> Step:
+        """Perform the actions and store what they did.
+
+        Args:
+            env: the environments.
+            observations: the present ones, [n, S].
+            actions: of each.
+            number: of the step, for the error.
+
+        Raises:
+            EnvironmentFailedError: an environment raised an exception, which is the cause.
+            EnvironmentDataError: it returned something that is not finite; nothing is stored.
+        """
+        start = episode_start(env)
+        if start is not None:
+            start.last_step = None
+        try:
+            new_obs, rewards, dones, infos = env.step(actions.reshape(-1, *(env.action_space.shape or ())))
+        except Exception as error:
+            self._keep_last_step(env, observations, actions)
+            has_name = isinstance(error, EnvironmentFailedError)
+            what = str(error) if has_name else f"the environment raised {type(error).__name__}: {error}"
+            raise EnvironmentFailedError(f"step {number}: {what}") from (error.__cause__ if has_name else error)
+        assert isinstance(new_obs, ndarray)
+        # At an episode's end the environment has been reset already, and the true next observation is set aside.
+        after, terminated = new_obs.copy(), dones.copy()
+        for index in np.flatnonzero(dones):
+            after[index] = infos[index]["terminal_observation"]
+            terminated[index] = not infos[index].get("TimeLimit.truncated", False)
+        normalize = unwrap_vec_normalize(env)
+        if normalize is not None:
+            rewards = normalize.get_original_reward()
+        self._append(observations, actions, after, rewards, terminated)
+        return Step(new_obs, rewards, dones, list(infos), terminated)
+
+    def _append(
+        self, observations: ndarray, actions: ndarray, after: ndarray, rewards: ndarray, terminated: ndarray
+    ) -> None:
+        episodes = np.array([running.index for running in self.running])
+        self.store.extend(observations, actions, after, reward=rewards, terminated=terminated, episode=episodes)
+        for running, reward, ended in zip(self.running, rewards, terminated, strict=True):
+            running.record.add_reward(float(reward), terminated=bool(ended))
+
+    def _keep_last_step(self, env: VecEnv, observations: ndarray, actions: ndarray) -> None:
+        """Store the step that ended an episode, where it is the reset after it that failed."""
+        start = episode_start(env)
+        if start is None or start.last_step is None or not any(start.last_step[2:4]):
+            return
+        after, reward, terminated, _, _ = start.last_step
+        with suppress(EnvironmentDataError):
+            rewards = np.array([reward], dtype=np.float32)
+            self._append(observations, actions, np.asarray(flatten(after))[None], rewards, np.array([bool(terminated)]))
+            self.running[0].has_explored = True
+
+    def state_dict(self) -> StateDict:
+        """Plans, records and numbers of the running episodes."""
+        state: StateDict = {"num_envs": len(self.running), **plans_to_tensors([each.carried for each in self.running])}
+        for i, running in enumerate(self.running):
+            state |= {f"{i}.index": running.index, f"{i}.has_explored": running.has_explored}
+            state |= {f"{i}.record.{name}": value for name, value in running.record.state_dict().items()}
+        return state
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Go on with the saved episodes; those of another number of environments are given up.
+
+        Where the agent's planner is another one or looks ahead otherwise, or plans sooner again, plans become cold.
+
+        Raises:
+            KeyError, TypeError, ValueError: the state is not one of running episodes.
+        """
+        num_envs = saved_num_envs(state)
+        has_explored = [bool(state[f"{i}.has_explored"]) for i in range(num_envs)]
+        if num_envs != len(self.running):
+            self.running = self._new_episodes(len(self.running), has_explored=all(has_explored))
+            return
+        plans = self._saved_plans(state)
+        for i, (running, plan) in enumerate(zip(self.running, plans, strict=True)):
+            index = state[f"{i}.index"]
+            if not isinstance(index, int) or not -1 <= index <= LARGEST_COUNT:
+                raise ValueError(f"the number of a running episode must lie in -1 to {LARGEST_COUNT}, got {index!r}")
+            running.carried, running.index, running.has_explored = plan, index, has_explored[i]
+            prefix = f"{i}.record."
+            record = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+            if record:  # files of the first schema have none
+                running.record.load_state_dict(record)
+
+    def _saved_plans(self, state: StateDict) -> list[PlanState]:
+        controller, num_envs = self._controller, len(self.running)
+        expected = plans_to_tensors([controller.cold] * num_envs)
+        horizons = {name: [*state[name].shape[1:2]] for name in expected if name in state}
+        if horizons != {name: [*value.shape[1:2]] for name, value in expected.items()}:
+            return [controller.cold] * num_envs
+        plans = plans_from_tensors(state, controller.cold, num_envs, controller.horizon)
+        return [plan if plan.age < controller.actions_per_plan else controller.cold for plan in plans]
+
+
+def saved_num_envs(state: StateDict) -> int:
+    """How many environments the saved episodes ran in.
+
+    Raises:
+        ValueError: no agent has so many.
+    """
+    num_envs = state.get("num_envs")
+    if not isinstance(num_envs, int) or not 1 <= num_envs <= MOST_ENVIRONMENTS:
+        raise ValueError(f"an agent has 1 to {MOST_ENVIRONMENTS} environments, got {num_envs!r}")
+    return num_envs
+
+
+def next_episode(store: TransitionStore, running: Sequence[RunningEpisode]) -> int:
+    """A number that neither a stored episode has nor one of those that are running."""
+    stored = int(store.episodes.max()) + 1 if len(store) else 0
+    return max([stored, *(episode.index + 1 for episode in running)])

@@ -1,0 +1,134 @@
+"""The environment as the agent has it: a VecEnv that can be planned for, and what is asked of it by name.
+
+`task.py` finds rewards, terminations and observation specs on what is made here.
+"""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+
+from gym_dgpmpc.tasks.dict_observations import flattened, layout
+from gym_dgpmpc.tasks.replay import options_to_reset, remember_starts
+
+
+def wrapped_env(env: GymEnv | str) -> VecEnv:
+    """The environment, or the registered one of this id, as a monitored VecEnv that can be planned for and resumed.
+
+    Dict observations come out of it as vectors.
+
+    Raises:
+        TypeError: it is neither an environment nor the id of one.
+        ValueError, AssertionError: see `check_env`.
+    """
+    _refuse_no_environment(env)
+    vec_env = flattened(BaseAlgorithm._wrap_env(maybe_make_env(env, 0)))
+    check_env(vec_env)
+    remember_starts(vec_env)
+    return vec_env
+
+
+def _refuse_no_environment(env: object) -> None:
+    if not isinstance(env, (str, gym.Env, VecEnv)):
+        told = (
+            f"the class {env.__name__}: make an instance" if isinstance(env, type) else f"{type(env).__name__} {env!r}"
+        )
+        raise TypeError(
+            "env must be a Gymnasium environment, the id of a registered one, or a VecEnv of Stable-Baselines3 "
+            f"(`make_vec_env`; not Gymnasium's own vector environments), got {told}"
+        )
+
+
+def check_env(env: VecEnv) -> None:
+    """Refuse what cannot be planned for, naming what was received.
+
+    Raises:
+        ValueError: an observation that is not a vector of real numbers, an action that is unbounded or not of real
+            numbers, or normalised observations.
+        AssertionError: an action space that is not a Box, as from every SB3 algorithm.
+    """
+    observation, action = env.observation_space, env.action_space
+    if not isinstance(observation, spaces.Box) or len(observation.shape) != 1 or observation.dtype.kind != "f":
+        raise ValueError(
+            "the dynamics model learns vectors of real numbers: the observation space must be a one-dimensional Box of "
+            f"floats, or a Dict of such, got {observation}. gymnasium.wrappers.FlattenObservation makes one of nested "
+            "vectors; images are not supported"
+        )
+    assert isinstance(action, spaces.Box), (
+        f"The algorithm only supports {spaces.Box} as action spaces but {action} was provided: "
+        "the planner searches real-valued action sequences. For discrete actions see SB3's DQN or PPO"
+    )
+    if action.dtype.kind != "f":
+        raise ValueError(
+            f"the planner searches real-valued actions: the action space must be a Box of floats, got {action}. "
+            "gymnasium.wrappers.TransformAction can round them for an environment that takes whole numbers"
+        )
+    bad = ~(np.isfinite(action.low) & np.isfinite(action.high) & (action.low <= action.high))
+    if bad.any():
+        where = "" if bad.all() else f" (those at {np.argwhere(bad).tolist()} are not)"
+        raise ValueError(
+            f"the planner needs finite action bounds{where}, got low = {action.low} and high = {action.high}; "
+            "gymnasium.wrappers.TransformAction(env, lambda action: action, Box(low, high)) gives an environment bounds"
+        )
+    normalize = unwrap_vec_normalize(env)
+    if isinstance(normalize, VecNormalize) and normalize.norm_obs:
+        raise ValueError(
+            "got VecNormalize(norm_obs=True): its moving statistics would change the meaning of the transitions "
+            "already stored and of the reward function. Use norm_obs=False; the dynamics model standardises for itself"
+        )
+
+
+def offered_by(env: VecEnv | None, name: str) -> Any:
+    """An attribute of the (first) environment under all its wrappers, or None.
+
+    Raises:
+        ValueError: it cannot be sent from the process that the environment runs in, which has ended of it.
+    """
+    try:
+        return env.get_attr(name)[0] if env is not None and env.has_attr(name) else None
+    except (EOFError, ConnectionError) as error:
+        raise ValueError(
+            f"the environment's attribute {name!r} cannot be sent from the process that it runs in (its own error is "
+            "printed above): what is pickled must be a function or class at the top level of a module, not a lambda or "
+            f"a function within another. Or make the environment without it and pass {name}=... to the agent"
+        ) from error
+
+
+def environment_id(env: VecEnv | None) -> str | None:
+    """What `gymnasium.make` makes the environment from, once this package is imported; None if it is not registered.
+
+    The module of an environment from elsewhere stands before its id, for importing that is what registers it.
+    """
+    spec = offered_by(env, "spec")
+    if spec is None:
+        return None
+    entry = spec.entry_point
+    module = entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "__main__")
+    package = module.partition(".")[0]
+    if package == "gymnasium_robotics":
+        return f"gym_dgpmpc.envs.robotics:{spec.id}"
+    return spec.id if package in ("gymnasium", "gym_dgpmpc", "__main__") else f"{module}:{spec.id}"
+
+
+def about_environment(env: VecEnv) -> dict[str, Any]:
+    """What a file says of the environment, as plain values: its id, the parts of Dict observations, reset's options."""
+    return {
+        "environment": environment_id(env),
+        "observation_parts": {key: [part.start, part.stop] for key, part in layout(env).items()},
+        "reset_options": options_to_reset(env, again=True),
+    }
+
+
+def describe(env: VecEnv) -> str:
+    """The environment's id if it is a registered one, else its class."""
+    spec = offered_by(env, "spec")
+    return f"the environment {spec.id}" if spec is not None else f"the environment {offered_by(env, 'unwrapped')}"
+
+
+def flat_size(space: spaces.Space) -> int:
+    """How many numbers an element of a Box holds."""
+    return int(np.prod(space.shape or ()))
