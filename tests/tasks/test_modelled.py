@@ -90,7 +90,7 @@ class TestVector:
         assert vector.task(Task(None, None, "learned", "never")).terminated_fn is None
         plain = Task(far, far)
         assert ModelledVector(3, self.spec).task(plain) == plain
-        with pytest.raises(ValueError, match="neither known"):
+        with pytest.raises(ValueError, match="got neither"):
             ModelledVector(3, self.spec).task(Task(None, None, "learned"))
 
 

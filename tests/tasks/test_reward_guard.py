@@ -17,17 +17,17 @@ def guard_warnings(learner, steps=LENGTH + 3):
     return [str(each.message) for each in caught if "disagrees" in str(each.message)]
 
 
-def test_functions_that_agree_say_nothing():
+def test_functions_that_agree_do_not_warn():
     ended = KnownPointMass(terminate_beyond=1.2)
     assert guard_warnings(agent()) == []
     assert guard_warnings(agent(ended, terminated_fn=lambda after: after[..., 0].abs() > 1.2), 25) == []
 
 
-def test_a_reward_that_disagrees_is_told_once_with_its_numbers():
+def test_a_reward_that_disagrees_warns_once_with_its_numbers():
     learner = agent(reward_fn=lambda o, a, n: reward_fn(o, a, n) + 0.5 * (o[..., 1] == 0))
     (message,) = guard_warnings(learner, 25)
     stored = learner.store.rewards[0].item()
-    assert "reward_fn disagrees with what the environment returned in 1 of 10 transitions, most at number 0" in message
+    assert "1 of 10 transitions" in message and "transition 0" in message
     assert f"reward_fn gives {stored + 0.5:.6g}, the environment returned {stored:.6g}." in message
 
 
