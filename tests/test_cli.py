@@ -269,7 +269,7 @@ def test_a_task_without_end(run):
     often = ["--timesteps", 30, "--random-steps", 8, "--train-freq", 9, "--no-video", "--out", "a"]
     assert run("train", "ToyPushForever-v0", *SMALLEST, *often).exit_code == 0
     checkpoint = read_checkpoint("a/agent.zip")
-    assert checkpoint.config["counters"]["num_fitted"] == 26
+    assert checkpoint.config["values"]["progress"]["num_fitted"] == 26
 
 
 def test_an_error_without_words_says_where_it_was(run, monkeypatch):

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
@@ -51,8 +52,9 @@ from gym_dgpmpc.planning.plan_state import PackedPlans
 from gym_dgpmpc.planning.registry import is_ready_made, make_planner, planner_factory
 from gym_dgpmpc.randomness import Generators, derive_seed, fresh_seed, split_seed
 from gym_dgpmpc.settings import Setting, joined, refuse_unknown, settings_of
-from gym_dgpmpc.tasks.dict_observations import FlatDict
+from gym_dgpmpc.tasks.dict_observations import FlatDict, original_space
 from gym_dgpmpc.tasks.environment import flat_size, wrapped_env
+from gym_dgpmpc.tasks.exported import arrays, minari_dataset, replay_buffer
 from gym_dgpmpc.tasks.functions import Learned
 from gym_dgpmpc.tasks.logged import Logged, read_logged
 from gym_dgpmpc.tasks.reward_guard import disagreements
@@ -430,7 +432,8 @@ class MPCAgent(BaseAlgorithm):
         Args:
             data: an SB3 `ReplayBuffer` or `DictReplayBuffer`, a Minari dataset, or a mapping of arrays, steps first:
                 "observation" [n, S], "action" [n, A], "next_observation" [n, S], "reward" [n] and "terminated" [n]
-                (if it is left out, none was). Dict observations are dicts of such. Of a buffer with
+                (if it is left out, none was), and "episode" [n], integers that are equal for steps of one episode (if
+                it is left out, all are of one). Dict observations are dicts of such. Of a buffer with
                 ``optimize_memory_usage`` the last steps of episodes are left out: it does not keep what they led to.
             scaled_actions: whether actions are given in [-1, 1] whatever the action space, as SB3's algorithms keep
                 them in their buffers. None: so it is in a `ReplayBuffer`, and in nothing else.
@@ -440,6 +443,45 @@ class MPCAgent(BaseAlgorithm):
             TypeError: the data are none of these.
         """
         self.collector.add_logged(read_logged(data, scaled_actions, self.observation_space, self.action_space))
+
+    def to_arrays(self) -> dict[str, Any]:
+        """Copies of all stored transitions, as `add_transitions` takes them; see `tasks.exported.arrays`.
+
+        Raises:
+            EnvironmentDataError: nothing is stored.
+        """
+        return arrays(self.store, original_space(self.env, self.observation_space), self.action_space)
+
+    def to_replay_buffer(self, buffer_size: int | None = None, device: torch.device | str = "auto") -> ReplayBuffer:
+        """All stored transitions as SB3's off-policy algorithms keep them.
+
+            sac.replay_buffer = agent.to_replay_buffer()
+
+        Args:
+            buffer_size: rows of the buffer, at least as many as are stored, which is what None gives.
+            device: where the buffer's samples are placed.
+
+        Raises:
+            EnvironmentDataError: nothing is stored.
+        """
+        space = original_space(self.env, self.observation_space)
+        return replay_buffer(self.store, space, self.action_space, buffer_size, device)
+
+    def to_minari(self, dataset_id: str, **metadata: Any) -> Any:
+        """Write all stored episodes as a new Minari dataset, and return it; see `tasks.exported.minari_dataset`.
+
+        Args:
+            dataset_id: "namespace/name-v0".
+            **metadata: of `minari.create_dataset_from_buffers`, such as ``env``, ``author`` and ``description``.
+
+        Raises:
+            EnvironmentDataError: nothing is stored.
+            ImportError: Minari is not installed.
+            ValueError: the id is not one of Minari's, or the dataset exists.
+        """
+        space = original_space(self.env, self.observation_space)
+        metadata = {"algorithm_name": type(self).__name__, **metadata}
+        return minari_dataset(self.store, space, self.action_space, dataset_id, **metadata)
 
     # ---------------------------------------------------------------------------------------------------- learning
 

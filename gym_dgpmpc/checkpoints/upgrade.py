@@ -53,7 +53,9 @@ def upgraded(config: Config, tensors: Tensors, schema: int) -> tuple[Config, Ten
         "episodes": episodes,
         "spaces": {name: value for name, value in own.items() if name.startswith(SPACES)},
     }
-    present: Config = {name: config[name] for name in ("class", "arguments", "space_dtypes", "versions") if name in config}
+    present: Config = {
+        name: config[name] for name in ("class", "arguments", "space_dtypes", "versions") if name in config
+    }
     if "arguments" in present and isinstance(present["arguments"], dict):
         # Then every named agent planned by CEM; of a plain MPCAgent the planner was never saved.
         planner = None if config.get("class") == "MPCAgent" else "cem"

@@ -1,7 +1,7 @@
-"""Dict observations as vectors, and what goal environments know of themselves.
+"""Dict observations as vectors, and the reward and observation spec of goal environments.
 
-A Dict of vectors becomes one vector: its parts in the alphabetical order of their keys, so that a goal environment's
-is (achieved_goal, desired_goal, observation).
+A Dict of vectors becomes one vector, with the parts in the alphabetical order of their keys: (achieved_goal,
+desired_goal, observation) in a goal environment.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,17 +20,21 @@ from gym_dgpmpc.types import ObservationSpec
 ACHIEVED, DESIRED = "achieved_goal", "desired_goal"
 
 REPEATS_ACHIEVED_GOAL = ("gymnasium_robotics.envs.fetch.", "gymnasium_robotics.envs.maze.point_maze")
-"""Modules of the environments whose observation holds the achieved goal once more."""
+"""Modules of the environments whose "observation" repeats the achieved goal."""
 
 
 class FlatDict(VecEnvWrapper):
-    """A VecEnv of Dict observations as one of vectors.
+    """A VecEnv of Dict observations, whose observations it makes vectors.
 
     Args:
         venv: its observation space must be a Dict of one-dimensional Boxes of floats.
 
+    Attributes:
+        dict_space: the observation space of ``venv``.
+        layout: where in the vector each part is.
+
     Raises:
-        ValueError: it is not.
+        ValueError: a part of the space is not a one-dimensional Box of floats.
     """
 
     def __init__(self, venv: VecEnv):
@@ -39,10 +43,11 @@ class FlatDict(VecEnvWrapper):
         for key, part in space.items():
             if not isinstance(part, spaces.Box) or len(part.shape) != 1 or part.dtype.kind != "f":
                 raise ValueError(
-                    "of a Dict of observations every part must be a one-dimensional Box of floats, got "
-                    f"{part} for {key!r}. gymnasium.wrappers.FilterObservation leaves parts out, FlattenObservation "
-                    "makes one vector of nested ones; images are not supported"
+                    "every part of a Dict observation space must be a one-dimensional Box of floats, got "
+                    f"{part} for {key!r}. Leave the part out with gymnasium.wrappers.FilterObservation, or make nested "
+                    "parts one vector with FlattenObservation; images are not supported"
                 )
+        self.dict_space = space
         boxes = [space[key] for key in sorted(space.spaces)]
         low, high = (np.concatenate([getattr(box, name) for box in boxes]) for name in ("low", "high"))
         super().__init__(venv, spaces.Box(low, high, dtype=low.dtype.type))
@@ -63,22 +68,22 @@ class FlatDict(VecEnvWrapper):
 
 
 def flattened(env: VecEnv) -> VecEnv:
-    """The same with vectors in place of Dict observations; others are left as they are."""
+    """The environment, in a `FlatDict` if its observations are Dicts."""
     return FlatDict(env) if isinstance(env.observation_space, spaces.Dict) else env
 
 
 def flatten(observation: Any) -> Any:
-    """The parts of a Dict observation, or of a batch of them, along the last dimension; others are left as they are."""
+    """The parts of a Dict observation, or of a batch of them, joined along the last dimension; others unchanged."""
     if not isinstance(observation, Mapping):
         return observation
     return np.concatenate([np.asarray(observation[key]) for key in sorted(observation)], axis=-1)
 
 
 def check_parts(observation: Any, parts: dict[str, slice]) -> None:
-    """Refuse a Dict observation, or a batch of them, that has not the parts of `layout`; of no parts nothing is known.
+    """Refuse a Dict observation, or a batch of them, whose parts are not those of `layout`; empty ``parts`` allow any.
 
     Raises:
-        ValueError: a part is missing, unknown or of another shape.
+        ValueError: a part is missing, unknown or of the wrong shape.
     """
     if not isinstance(observation, Mapping) or not parts:
         return
@@ -87,12 +92,12 @@ def check_parts(observation: Any, parts: dict[str, slice]) -> None:
     batch = next(iter(received.values()), ())[:-1]
     if len(batch) > 1 or received != {key: (*batch, *shape) for key, shape in expected.items()}:
         raise ValueError(
-            f"expected a dict of the shapes {expected}, or each with a dimension of n before, got {received}"
+            f"expected a dict of the shapes {expected}, or with a first dimension n in each, got {received}"
         )
 
 
 def layout_of(space: spaces.Space) -> dict[str, slice]:
-    """Where in the vector the parts of a Dict space are."""
+    """Where in the vector each part of a Dict space is."""
     assert isinstance(space, spaces.Dict)
     layout, start = {}, 0
     for key in sorted(space.spaces):
@@ -103,18 +108,22 @@ def layout_of(space: spaces.Space) -> dict[str, slice]:
 
 
 def layout(env: VecEnv | None) -> dict[str, slice]:
-    """Where in the vectors of a `FlatDict` the parts are; empty in every other environment."""
-    while isinstance(env, VecEnvWrapper):
-        if isinstance(env, FlatDict):
-            return env.layout
-        env = env.venv
-    return {}
+    """Where in the vectors of a `FlatDict` each part is; empty for any other environment, and for None."""
+    flat = _flat_dict(env)
+    return {} if flat is None else flat.layout
+
+
+def original_space(env: VecEnv | None, space: spaces.Space) -> spaces.Space:
+    """The Dict space of the environment in a `FlatDict`; ``space`` for any other environment, and for None."""
+    flat = _flat_dict(env)
+    return space if flat is None else flat.dict_space
 
 
 def goal_spec(env: VecEnv | None) -> ObservationSpec:
-    """How to read a goal environment's vectors: the goal stays for an episode, and nothing but the reward feels it.
+    """How to read a goal environment's vectors: the goal is constant in an episode, and only the reward depends on it.
 
-    Hindsight relabelling assumes the same. Where the observation holds the achieved goal too, one of them is no input.
+    Hindsight relabelling assumes the same. Where "observation" repeats the achieved goal, only the repetition is an
+    input.
     """
     parts = layout(env)
     if DESIRED not in parts:
@@ -128,12 +137,13 @@ def goal_spec(env: VecEnv | None) -> ObservationSpec:
 
 @dataclass(frozen=True)
 class GoalReward:
-    """A goal environment's `compute_reward` as a `gym_dgpmpc.types.RewardFn`: of the goal achieved by the step.
+    """A goal environment's `compute_reward` as a `gym_dgpmpc.types.RewardFn`, on the goal that the step achieved.
 
     Attributes:
-        compute_reward: (achieved [*b, G], desired [*b, G], info) -> [*b], in NumPy, as hindsight relabelling has it.
+        compute_reward: (achieved [*b, G], desired [*b, G], info) -> reward [*b], in NumPy, as hindsight relabelling
+            needs it.
         achieved: where in the vector the achieved goal is.
-        desired: where the desired one is.
+        desired: where in the vector the desired goal is.
     """
 
     compute_reward: Callable[[np.ndarray, np.ndarray, dict[str, Any]], Any]
@@ -142,13 +152,13 @@ class GoalReward:
 
     @classmethod
     def of(cls, env: VecEnv | None) -> "GoalReward | None":
-        """That of an environment with both goals and the method; None of any other."""
+        """The reward of an environment that has both goals and `compute_reward`; None for any other environment."""
         parts = layout(env)
         if env is None or not {ACHIEVED, DESIRED} <= set(parts) or not env.has_attr("compute_reward"):
             return None
 
         def compute_reward(achieved: np.ndarray, desired: np.ndarray, info: dict[str, Any]) -> Any:
-            # By the name of the method, so that it may be in another process.
+            # Called by its name, because the environment may be in another process.
             return env.env_method("compute_reward", achieved, desired, info, indices=[0])[0]
 
         return cls(compute_reward, parts[ACHIEVED], parts[DESIRED])
@@ -159,7 +169,7 @@ class GoalReward:
         action: Float[Tensor, "*b A"],
         next_observation: Float[Tensor, "*b S"],
     ) -> Float[Tensor, "*b"]:
-        """The reward of each step; ``observation`` and ``action`` play no part."""
+        """The rewards of the steps; they do not depend on ``observation`` and ``action``."""
         achieved, desired = (
             next_observation[..., part].double().cpu().numpy() for part in (self.achieved, self.desired)
         )
@@ -169,3 +179,12 @@ class GoalReward:
 
 def _indices(part: slice) -> tuple[int, ...]:
     return tuple(range(part.start, part.stop))
+
+
+def _flat_dict(env: VecEnv | None) -> FlatDict | None:
+    """The `FlatDict` among an environment's wrappers."""
+    while isinstance(env, VecEnvWrapper):
+        if isinstance(env, FlatDict):
+            return env
+        env = env.venv
+    return None

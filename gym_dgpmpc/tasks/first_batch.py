@@ -1,4 +1,4 @@
-"""Trying a reward or termination function on a batch of states before anything is learned with it."""
+"""Try a reward or termination function on a batch of states before anything is learned with it."""
 
 import warnings
 from collections.abc import Callable
@@ -12,10 +12,10 @@ REWARD_SIGNATURE = "reward_fn(observation [*b, S], action [*b, A], next_observat
 TERMINATED_SIGNATURE = "terminated_fn(next_observation [*b, S]) -> terminated [*b], bool"
 
 HORIZON, PARTICLES = 4, 3
-"""Of the batch [H, P, K] that a function is tried on, the planner's shape; candidates are one more than numbers in an
-observation, so that no axis passes for another one."""
+"""H and P of the batch [H, P, K] on which a function is tried; a planner's batches have the same axes. There is one
+candidate more than numbers in an observation, so that a function that confuses the two axes fails."""
 WIDEST = 1e6
-"""Bounds further apart than this are no statement about what values occur."""
+"""Bounds further apart than this say nothing about which values occur."""
 
 
 def check_reward(
@@ -24,33 +24,34 @@ def check_reward(
     action_space: spaces.Box,
     device: torch.device | str,
 ) -> None:
-    """Try a reward function, and say what does not fit.
+    """Try a reward function, and report what is wrong with it.
 
-    Warns if it is not finite for some observations in a space that does not say what values occur.
+    Warns if it is not finite for some observations in a space whose bounds do not say which values occur.
 
     Raises:
-        ValueError: it raises, or returns another shape, dtype or device, or what is not finite.
+        ValueError: it raises, changes its arguments, or returns a tensor of the wrong shape, dtype or device or one
+            with numbers that are not finite.
         TypeError: it is not callable or does not return a tensor.
     """
     batch = example_batch(observation_space, action_space, device)
-    reward = _tried("reward_fn", REWARD_SIGNATURE, reward_fn, batch, is_bool=False)
+    reward = _checked_output("reward_fn", REWARD_SIGNATURE, reward_fn, batch, is_bool=False)
     bad = ~reward.isfinite()
     if not bad.any():
         return
     first = tuple(bad.nonzero()[0].tolist())
-    told = ", ".join(
+    inputs = ", ".join(
         f"{name} = {tensor[first].tolist()}"
         for name, tensor in zip(("observation", "action", "next_observation"), batch, strict=True)
     )
-    message = f"reward_fn must return finite numbers, but returned {reward[first].item()} for {told}"
-    says_what_occurs = bool((observation_space.high - observation_space.low < WIDEST).all())
-    if says_what_occurs or bad.all():
+    message = f"reward_fn must return finite numbers, but returned {reward[first].item()} for {inputs}"
+    bounds_are_informative = bool((observation_space.high - observation_space.low < WIDEST).all())
+    if bounds_are_informative or bad.all():
         raise ValueError(
-            f"{message}; these are from within the spaces {observation_space} and {action_space}. What the model "
-            "predicts can be as far off, so the function has to be finite there too"
+            f"{message}; these lie within the spaces {observation_space} and {action_space}. The model can predict "
+            "such observations, so make the function finite for them"
         )
     warnings.warn(
-        f"{message}. If such observations can be predicted, plans that lead to them will never be taken", stacklevel=4
+        f"{message}. If the model predicts such observations, plans that lead to them will never be taken", stacklevel=4
     )
 
 
@@ -60,14 +61,14 @@ def check_termination(
     action_space: spaces.Box,
     device: torch.device | str,
 ) -> None:
-    """Try a termination function, and say what does not fit.
+    """Try a termination function, and report what is wrong with it.
 
     Raises:
-        ValueError: it raises, or returns another shape, dtype or device.
+        ValueError: it raises, changes its argument, or returns a tensor of the wrong shape, dtype or device.
         TypeError: it is not callable or does not return a tensor.
     """
     _, _, after = example_batch(observation_space, action_space, device)
-    _tried("terminated_fn", TERMINATED_SIGNATURE, terminated_fn, (after,), is_bool=True)
+    _checked_output("terminated_fn", TERMINATED_SIGNATURE, terminated_fn, (after,), is_bool=True)
 
 
 def example_batch(
@@ -75,15 +76,16 @@ def example_batch(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Batches [H, P, K] of observations, actions and next observations, float32.
 
-    As in a plan, one action of a candidate is that of all particles, and the next observations are the observations of
-    a step later, in the same memory. Uniform between bounds; where there are none, or so wide ones that they say
-    nothing, normal about the place nearest to zero that is allowed. The spaces' own random numbers are not advanced.
+    As in a plan, all particles of a candidate share its actions, and the next observations are the observations of the
+    next step, in the same memory. Values are uniform between bounds. Without bounds, or where they are at least
+    `WIDEST` apart, values are normal about the allowed value nearest to zero. The spaces' own random numbers are not
+    advanced.
     """
     generator = np.random.default_rng(0)
     candidates = observation_space.low.size + 1
     states, actions = (
-        torch.as_tensor(each, dtype=torch.float32, device=device)
-        for each in (
+        torch.as_tensor(sample, dtype=torch.float32, device=device)
+        for sample in (
             _sample(observation_space, (HORIZON + 1, PARTICLES, candidates), generator),
             _sample(action_space, (HORIZON, 1, candidates), generator),
         )
@@ -97,34 +99,35 @@ def _sample(space: spaces.Box, batch: tuple[int, ...], generator: np.random.Gene
     with np.errstate(over="ignore"):
         bounded = high - low < WIDEST
     uniform = np.where(bounded, low, 0.0) + np.where(bounded, high - low, 1.0) * generator.random(shape)
-    # Around zero, or around a bound that excludes it, on the side that is allowed.
+    # About the allowed value nearest to zero; the last line clips to the bounds.
     normal = np.clip(0.0, low, high) + generator.standard_normal(shape)
     return np.where(bounded, uniform, np.clip(normal, low, high))
 
 
-def _tried(
+def _checked_output(
     name: str, signature: str, function: Callable[..., Tensor], batch: tuple[Tensor, ...], *, is_bool: bool
 ) -> Tensor:
     if not callable(function):
         raise TypeError(f"{name} must be a function {signature}, got {function!r}")
     shapes = ", ".join(str(list(tensor.shape)) for tensor in batch)
     shape, kind = batch[0].shape[:-1], "bool" if is_bool else "float"
-    expected = f"{name} must map tensors of shapes {shapes} to a {kind} tensor {list(shape)}; its signature is "
-    expected += signature
+    expected = (
+        f"{name} must map tensors of shapes {shapes} to a {kind} tensor {list(shape)}; its signature is {signature}"
+    )
     before = [tensor.clone() for tensor in batch]
     try:
         value = function(*batch)
     except Exception as error:
         raise ValueError(f"{expected}. It raised {type(error).__name__}: {error}") from error
     if not all(map(torch.equal, batch, before)):
-        raise ValueError(f"{expected}. It changed the tensors that it was given: work on a copy")
+        raise ValueError(f"{expected}. It changed its arguments: work on copies")
     if not isinstance(value, Tensor):
         raise TypeError(f"{expected}. It returned {type(value).__name__}")
-    right_kind = value.dtype == torch.bool if is_bool else value.is_floating_point()
-    if value.shape != shape or not right_kind:
+    has_kind = value.dtype == torch.bool if is_bool else value.is_floating_point()
+    if value.shape != shape or not has_kind:
         raise ValueError(f"{expected}. It returned {value.dtype} of shape {list(value.shape)}")
     if value.device != batch[0].device:
         raise ValueError(
-            f"{expected}, on the device of the batch, {batch[0].device}. It returned one on {value.device}"
+            f"{expected}, on the device of its arguments, {batch[0].device}. It returned a tensor on {value.device}"
         )
     return value

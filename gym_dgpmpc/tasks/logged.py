@@ -14,14 +14,15 @@ from gym_dgpmpc.tasks.dict_observations import flatten
 from gym_dgpmpc.tasks.environment import flat_size
 
 REQUIRED = ("observation", "action", "next_observation", "reward")
-FIELDS = (*REQUIRED, "terminated")
+OPTIONAL = ("terminated", "episode")
+FIELDS = (*REQUIRED, *OPTIONAL)
 ROUNDING = 1e-4
-"""Of an action's range; logged actions may leave the bounds by that much."""
+"""Logged actions may leave their bounds by this fraction of their range."""
 
 
 @runtime_checkable
 class EpisodeDataset(Protocol):
-    """A Minari dataset, as far as it is read here; each episode has one observation more than actions."""
+    """What is read here of a Minari dataset. An episode has one observation more than actions."""
 
     def iterate_episodes(self) -> Iterator[Any]: ...
 
@@ -30,7 +31,7 @@ Logged = Mapping[str, Any] | ReplayBuffer | EpisodeDataset
 
 
 class LoggedRows(NamedTuple):
-    """n logged steps; ``episode`` counts from 0."""
+    """n logged steps; ``episode`` numbers their episodes from 0 on."""
 
     observation: ndarray
     action: ndarray
@@ -47,23 +48,24 @@ def read_logged(
 
     Args:
         data: see `MPCAgent.add_transitions`.
-        scaled_actions: whether its actions are scaled to [-1, 1]; None: those of a `ReplayBuffer` alone.
+        scaled_actions: whether the actions are scaled to [-1, 1]. None: they are in a `ReplayBuffer`, and else not.
         observation_space: one-dimensional.
         action_space: finite bounds.
 
     Raises:
-        EnvironmentDataError: a field is missing, or has another shape or actions out of bounds.
-        TypeError: the data are of no kind that can be read.
+        EnvironmentDataError: there are no transitions, a field is missing, unknown or of the wrong shape, an episode's
+            number is not an integer, or an action is out of bounds.
+        TypeError: the data are not of a kind that can be read.
     """
     if isinstance(data, ReplayBuffer):
-        rows, in_buffer = _of_buffer(data), True
+        rows, in_buffer = _from_buffer(data), True
     elif isinstance(data, Mapping):
-        rows, in_buffer = _of_mapping(data), False
+        rows, in_buffer = _from_mapping(data), False
     elif isinstance(data, EpisodeDataset):
-        rows, in_buffer = _of_episodes(data), False
+        rows, in_buffer = _from_episodes(data), False
     else:
         raise TypeError(
-            f"logged transitions are a mapping with the arrays {', '.join(FIELDS)}, a ReplayBuffer of "
+            f"logged transitions must be a mapping with the arrays {', '.join(FIELDS)}, a ReplayBuffer of "
             f"Stable-Baselines3 or a Minari dataset, got {type(data).__name__}"
         )
     rows = rows._replace(action=_flat_actions(rows.action, action_space))
@@ -73,36 +75,46 @@ def read_logged(
     for name, value in rows._asdict().items():
         if value.shape != (count, *sizes[name]):
             raise EnvironmentDataError(
-                f"logged {name} must have the shape {[count, *sizes[name]]}, as there are {count} actions and the "
-                f"environment's spaces are {observation_space} and {action_space}, got {list(value.shape)}"
+                f"logged {name} must have the shape {[count, *sizes[name]]}, because there are {count} actions in "
+                f"{action_space} and observations are in {observation_space}, got {list(value.shape)}"
             )
     if not count:
-        raise EnvironmentDataError("the logged data hold no transitions")
+        raise EnvironmentDataError("the logged data hold 0 transitions; at least 1 is needed")
     scaled = in_buffer if scaled_actions is None else scaled_actions
     return rows._replace(action=_unscaled(rows.action, action_space, scaled))
 
 
-def _of_mapping(data: Mapping[str, Any]) -> LoggedRows:
+def _from_mapping(data: Mapping[str, Any]) -> LoggedRows:
     missing, unknown = [name for name in REQUIRED if name not in data], sorted(set(data) - set(FIELDS))
     if missing or unknown:
         raise EnvironmentDataError(
-            f"logged transitions have the fields {', '.join(FIELDS)}; missing: {missing}, unknown: {unknown}"
+            f"logged transitions must have the fields {', '.join(REQUIRED)} and may have {', '.join(OPTIONAL)}; "
+            f"missing: {missing}, unknown: {unknown}"
         )
     observation, action, after, reward = (np.asarray(flatten(data[name])) for name in REQUIRED)
     terminated = np.asarray(data["terminated"]) if "terminated" in data else np.zeros(reward.shape, dtype=bool)
-    return LoggedRows(observation, action, after, reward, terminated, np.zeros(len(action), dtype=np.int64))
+    episode = _numbered(data["episode"]) if "episode" in data else np.zeros(len(action), dtype=np.int64)
+    return LoggedRows(observation, action, after, reward, terminated, episode)
 
 
-def _of_episodes(data: EpisodeDataset) -> LoggedRows:
-    parts: list[list[ndarray]] = [[] for _ in LoggedRows._fields]
+def _numbered(episode: Any) -> ndarray:
+    """Episode numbers, whatever they are, as 0, 1, ... in the same order."""
+    array = np.asarray(episode)
+    if array.dtype.kind not in "iu":
+        raise EnvironmentDataError(f"logged episode must hold integers, got dtype {array.dtype}")
+    return np.unique(array, return_inverse=True)[1] if array.ndim == 1 else array  # others are refused by their shape
+
+
+def _from_episodes(data: EpisodeDataset) -> LoggedRows:
+    columns: list[list[ndarray]] = [[] for _ in LoggedRows._fields]
     for number, episode in enumerate(data.iterate_episodes()):
         observations, actions = np.asarray(flatten(episode.observations)), np.asarray(episode.actions)
         if len(observations) != len(actions) + 1:
             raise EnvironmentDataError(
-                f"logged episode {number} has {len(actions)} actions, so it must have {len(actions) + 1} observations, "
-                f"got {len(observations)}"
+                f"logged episode {number} must have {len(actions) + 1} observations, one more than its "
+                f"{len(actions)} actions, got {len(observations)}"
             )
-        columns = (
+        values = (
             observations[:-1],
             actions,
             observations[1:],
@@ -110,26 +122,27 @@ def _of_episodes(data: EpisodeDataset) -> LoggedRows:
             np.asarray(episode.terminations),
             np.full(len(actions), number),
         )
-        for part, column in zip(parts, columns, strict=True):
-            part.append(column)
-    if not parts[0]:
-        raise EnvironmentDataError("the logged dataset has no episodes")
-    return LoggedRows(*(np.concatenate(part) for part in parts))
+        for column, value in zip(columns, values, strict=True):
+            column.append(value)
+    if not columns[0]:
+        raise EnvironmentDataError("the logged dataset holds 0 episodes; at least 1 is needed")
+    return LoggedRows(*(np.concatenate(column) for column in columns))
 
 
-def _of_buffer(buffer: ReplayBuffer) -> LoggedRows:
-    """In the order in which they were added, one environment after the other.
+def _from_buffer(buffer: ReplayBuffer) -> LoggedRows:
+    """The rows in the order in which they were added, one environment after the other.
 
-    A buffer with ``optimize_memory_usage`` has lost what each episode ended in, the newest step aside: the last steps
-    of its episodes are left out.
+    A buffer with ``optimize_memory_usage`` keeps no next observation for the last step of an episode, unless that is
+    the newest step. These steps are left out.
     """
     size, position = buffer.buffer_size, buffer.pos
     steps = (np.arange(size) + position) % size if buffer.full else np.arange(position)
     if isinstance(buffer, DictReplayBuffer):
         before, after = flatten(buffer.observations)[steps], flatten(buffer.next_observations)[steps]
     elif buffer.optimize_memory_usage:
-        # The next observation stands where the next step's own is, and has overwritten the oldest step's. At an
-        # episode's end the reset's has come in its place.
+        # A step's next observation is kept only as the observation of the row after it. In a full buffer, that of the
+        # newest step has overwritten the oldest step's observation. After the last step of an episode, the row holds
+        # the observation of the reset.
         steps = steps[1:] if buffer.full else steps
         before, after = buffer.observations[steps], buffer.observations[(steps + 1) % size]
     else:
@@ -139,16 +152,16 @@ def _of_buffer(buffer: ReplayBuffer) -> LoggedRows:
     episode = np.cumsum(dones, axis=0) - dones
     episode = episode + np.concatenate([[0], np.cumsum(episode.max(axis=0, initial=0) + 1)[:-1]])
     columns = (before, buffer.actions[steps], after, buffer.rewards[steps], terminated, episode)
-    known = np.ones_like(dones)
+    is_complete = np.ones_like(dones)
     if buffer.optimize_memory_usage:
-        known[:-1] = ~dones[:-1]
-    return LoggedRows(*(column.swapaxes(0, 1)[known.T] for column in columns))
+        is_complete[:-1] = ~dones[:-1]
+    return LoggedRows(*(column.swapaxes(0, 1)[is_complete.T] for column in columns))
 
 
 def _flat_actions(action: ndarray, space: spaces.Box) -> ndarray:
-    """Actions of the space's shape as vectors; those of any other shape as they are, to be refused."""
-    shaped = action.ndim == 1 + len(space.shape) and action.shape[1:] == space.shape
-    return action.reshape(len(action), flat_size(space)) if shaped else action
+    """Actions of the space's shape as vectors. Others are returned unchanged, for the check of shapes to refuse."""
+    has_shape = action.ndim == 1 + len(space.shape) and action.shape[1:] == space.shape
+    return action.reshape(len(action), flat_size(space)) if has_shape else action
 
 
 def _unscaled(action: Float[ndarray, "n A"], space: spaces.Box, scaled: bool) -> ndarray:
@@ -158,11 +171,11 @@ def _unscaled(action: Float[ndarray, "n A"], space: spaces.Box, scaled: bool) ->
     outside = np.argwhere((action < least - margin) | (action > most + margin))
     if len(outside):
         row, component = outside[0]
-        told = "scaled to [-1, 1]" if scaled else f"within {low.tolist()} and {high.tolist()}"
+        expected = "scaled to [-1, 1]" if scaled else f"within {low.tolist()} and {high.tolist()}"
         raise EnvironmentDataError(
-            f"logged actions must be {told}, got {action[row, component]} in component {component} of step {row}, and "
-            f"{len(outside) - 1} more such numbers. scaled_actions={not scaled} reads them the other way; if the "
-            "environment has clipped them, clip them before they are added"
+            f"logged actions must be {expected}, got {action[row, component]} in component {component} of step {row} "
+            f"({len(outside)} numbers are out of bounds). If they are {'not ' if scaled else ''}scaled to [-1, 1], "
+            f"pass scaled_actions={not scaled}; if the environment clipped them, clip them before adding them"
         )
     if not scaled:
         return action

@@ -1,8 +1,8 @@
-"""The vector that the dynamics model learns: the observation, and what else of a step it has to predict.
+"""The vector that the dynamics model learns: the observation, and a reward or termination that has to be learned.
 
-A reward or termination that nobody knows as a function becomes one more number of the vector, predicted as it is and
-no input. Nothing but this module knows the difference: to the model it is a dimension like any other, and the planner
-reads it off the predicted vectors with a reward or termination function as usual.
+A reward or termination that is not known as a function becomes one more number of the vector. The model predicts its
+value, not its change, and is not fed it. Only this module knows the difference: to the model it is a dimension like any
+other, and the planner reads it from the predicted vectors with a reward or termination function as usual.
 """
 
 from dataclasses import dataclass, replace
@@ -18,8 +18,8 @@ from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn, Transition
 
 
 @dataclass(frozen=True)
-class Component:
-    """One number of the predicted vector, as a reward."""
+class PredictedReward:
+    """A reward function that reads the reward from the predicted vector, at ``index``."""
 
     index: int
 
@@ -33,8 +33,8 @@ class Component:
 
 
 @dataclass(frozen=True)
-class ComponentAboveHalf:
-    """One number of the predicted vector, which was 1 in steps that terminated and else 0, as a termination."""
+class PredictedTermination:
+    """A termination function that reads the predicted vector at ``index``: in the data 1 if terminated, else 0."""
 
     index: int
 
@@ -65,17 +65,17 @@ class ModelledVector:
 
     @property
     def spec(self) -> ObservationSpec:
-        """How to read the vector: what was added is predicted as it is, and no input.
+        """How to read the vector. The model predicts the values of the added numbers and is not fed them.
 
-        What is constant, such as a goal, and the headings of vectors are inputs then even if the dynamics do not depend
-        on them, because what was added may.
+        With added numbers, constants such as a goal, and the headings of vectors, are inputs even if the dynamics do
+        not depend on them, because the added numbers may.
         """
         added = tuple(range(self.observation_size, self.size))
         spec = self.observation_spec
         if not added:
             return spec
-        let_in = {heading for heading, _, _ in spec.body_frame} | set(spec.constant)
-        not_inputs = (*(i for i in spec.not_inputs if i not in let_in), *added)
+        inputs = {heading for heading, _, _ in spec.body_frame} | set(spec.constant)
+        not_inputs = (*(i for i in spec.not_inputs if i not in inputs), *added)
         return replace(spec, absolute=(*spec.absolute, *added), not_inputs=not_inputs)
 
     def transitions(self, store: TransitionStore) -> Transitions:
@@ -85,7 +85,7 @@ class ModelledVector:
         if not added:
             return Transitions(observation, action, after)
         column = torch.stack(added, dim=-1)
-        # Before a step the added numbers mean nothing, and neither inputs nor targets take them from there.
+        # The added numbers have no value before a step. As absolute and not inputs, they are never read from there.
         return Transitions(
             torch.cat([observation, torch.zeros_like(column)], dim=-1), action, torch.cat([after, column], dim=-1)
         )
@@ -95,7 +95,7 @@ class ModelledVector:
         return np.pad(observation, (0, self.size - self.observation_size))
 
     def functions(self, found: TaskFunctions) -> TaskFunctions:
-        """The same reward and termination as functions of the vector; a function that is known goes before.
+        """Reward and termination as functions of the vector; a known function is preferred to what is predicted.
 
         Raises:
             ValueError: the reward is neither known nor predicted.
@@ -104,20 +104,20 @@ class ModelledVector:
         reward_fn, terminated_fn = found.reward_fn, found.terminated_fn
         if reward_fn is None:
             if not self.reward:
-                raise ValueError("the reward is neither known as a function nor predicted")
-            reward_fn = Component(size)
+                raise ValueError("the reward must be known as a function or predicted, got neither: pass reward_fn")
+            reward_fn = PredictedReward(size)
         elif self.size > size:
-            reward_fn = _OfObservation(reward_fn, size)
+            reward_fn = RewardOnObservation(reward_fn, size)
         if terminated_fn is not None and self.size > size:
-            terminated_fn = _EndOfObservation(terminated_fn, size)
+            terminated_fn = TerminationOnObservation(terminated_fn, size)
         elif terminated_fn is None and self.terminated and found.terminated_source == "learned":
-            terminated_fn = ComponentAboveHalf(size + self.reward)
+            terminated_fn = PredictedTermination(size + self.reward)
         return found._replace(reward_fn=reward_fn, terminated_fn=terminated_fn)
 
 
 @dataclass(frozen=True)
-class _OfObservation:
-    """A reward of the observation, which is the beginning of the vector."""
+class RewardOnObservation:
+    """A known reward function, applied to the observation: the first ``size`` numbers of the vector."""
 
     reward_fn: RewardFn
     size: int
@@ -132,8 +132,8 @@ class _OfObservation:
 
 
 @dataclass(frozen=True)
-class _EndOfObservation:
-    """A termination of the observation, which is the beginning of the vector."""
+class TerminationOnObservation:
+    """A known termination function, applied to the observation: the first ``size`` numbers of the vector."""
 
     terminated_fn: TerminatedFn
     size: int

@@ -71,7 +71,7 @@ def test_the_cart_pole_by_its_id(agent_class, tmp_path):
     learner.learn(15)
     assert learner.observation_spec == ObservationSpec(angles=(1,)) == learner.dynamics.encoder.spec
     learner.save(tmp_path / "agent")
-    alone = agent_class.load(tmp_path / "agent", reward_fn=learner.task.reward_fn)
+    alone = agent_class.load(tmp_path / "agent", reward_fn=learner.task.functions.reward_fn)
     observation = np.array([0.1, 0.2, 0.3, 0.4])
     expected = learner.predict(observation, deterministic=True)[0]
     np.testing.assert_array_equal(alone.predict(observation, deterministic=True)[0], expected)

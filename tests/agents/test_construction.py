@@ -109,14 +109,14 @@ def test_a_refused_environment_changes_nothing():
     assert learner.n_envs == 1
     assert learner.env is before
     assert learner.dynamics is dynamics
-    assert not learner.modelled.reward
+    assert not learner.task.modelled.reward
 
 
 def test_an_unknown_reward_says_what_to_pass():
     with pytest.raises(UnknownRewardError, match=r"PointMass.*reward_fn=.*S = 2, A = 1"):
         agent(PointMass())
     learner = agent(PointMass(), reward_fn=reward_fn).learn(12)
-    assert learner.task.reward_fn is reward_fn
+    assert learner.task.functions.reward_fn is reward_fn
     with pytest.raises(UnknownRewardError, match="<PointMass"):
         agent(KnownPointMass()).set_env(PointMass())
 
@@ -125,15 +125,15 @@ def test_a_given_reward_goes_before_the_environments():
     def other(observation, action, next_observation):
         return next_observation[..., 0]
 
-    assert agent(KnownPointMass(), reward_fn=other).task.reward_fn is other
+    assert agent(KnownPointMass(), reward_fn=other).task.functions.reward_fn is other
     learner = agent(KnownPointMass(), reward_fn=other)
     learner.set_env(KnownPointMass())
-    assert learner.task.reward_fn is other
+    assert learner.task.functions.reward_fn is other
 
 
 def test_a_reward_is_found_under_wrappers():
     env = gym.wrappers.TimeLimit(gym.wrappers.PassiveEnvChecker(KnownPointMass()), 5)
-    assert agent(env).task.reward_fn is reward_fn
+    assert agent(env).task.functions.reward_fn is reward_fn
 
 
 @pytest.mark.parametrize(
@@ -143,12 +143,12 @@ def test_a_reward_is_found_under_wrappers():
         (lambda o, a, n: -n.sum(), ValueError, r"returned torch.float32 of shape \[\]"),
         (lambda o, a, n: n[..., 0] > 0, ValueError, "returned torch.bool"),
         (lambda o, a, n: n[..., 0].int(), ValueError, "returned torch.int32"),
-        (lambda o, a, n: n[..., 0].to("meta"), ValueError, "on the device of the batch, cpu. It returned one on meta"),
+        (lambda o, a, n: n[..., 0].to("meta"), ValueError, "device.*cpu.*meta"),
         (lambda o, a, n: n[..., 5], ValueError, "raised IndexError"),
         (lambda o, a: a, ValueError, "raised TypeError"),
         (lambda o, a, n: -(n**2).sum(2), ValueError, r"returned torch.float32 of shape \[4, 3, 2\]"),
         (lambda o, a, n: -a.view(-1), ValueError, "raised RuntimeError: view size is not compatible"),
-        (lambda o, a, n: n.sub_(1.0)[..., 0], ValueError, "changed the tensors that it was given"),
+        (lambda o, a, n: n.sub_(1.0)[..., 0], ValueError, "changed its arguments"),
         (lambda o, a, n: n.numpy()[..., 0], TypeError, "returned ndarray"),
     ],
 )

@@ -97,7 +97,7 @@ def test_metrics_count_late_plans_and_leave_out_what_was_not_expected():
 
 def test_a_budget_that_is_set_later_takes_effect_at_once():
     learner = agent().learn(2 * LENGTH)
-    learner.planning.time_budget = 1e-9
+    learner.controller.time_budget = 1e-9
     with pytest.warns(UserWarning, match="time_budget"):
         learner.predict(OBSERVATION)
     assert learner.num_late_plans == 1

@@ -90,7 +90,7 @@ def test_the_cart_pole_by_its_id(name, tmp_path):
     learner.learn(15)
     assert learner.observation_spec.angles == (1,)
     learner.save(tmp_path / "agent")
-    alone = MPCAgent.load(tmp_path / "agent", reward_fn=learner.task.reward_fn)
+    alone = MPCAgent.load(tmp_path / "agent", reward_fn=learner.task.functions.reward_fn)
     assert type(alone) is DGPMPCAgent
     assert alone.observation_spec == learner.observation_spec
     observation = np.array([0.1, 0.2, 0.3, 0.4])

@@ -160,7 +160,7 @@ def test_a_file_of_several_serves_another_number(count, tmp_path):
     learner.set_env(several(count))
     assert len(learner.learn(count * 2, reset_num_timesteps=False).store) == 39 + 2 * count
     same = MPCAgent.load(tmp_path / "agent", env=learner.env if count == 3 else several(3), **parts, force_reset=False)
-    assert [running.index for running in same._running] == [3, 4, 5]
+    assert [running.index for running in same.collector.running] == [3, 4, 5]
 
 
 def test_environments_in_other_processes():

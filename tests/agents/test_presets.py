@@ -19,7 +19,7 @@ def test_stock_settings_make_an_agent(env_id):
         importlib.import_module("gym_dgpmpc.envs.robotics")
     env = gymnasium.make(env_id)
     agent = DGPMPCAgent(env, **settings, seed=0)
-    assert (agent.planning.horizon, agent.planner.num_candidates) == (settings["horizon"], settings["num_candidates"])
+    assert (agent.controller.horizon, agent.planner.num_candidates) == (settings["horizon"], settings["num_candidates"])
     # Plans do not look beyond an episode's end, and what an episode needs to end well is seen before the first one.
     assert settings["horizon"] < env.spec.max_episode_steps
     assert settings["horizon"] <= settings.get("learning_starts", env.spec.max_episode_steps)

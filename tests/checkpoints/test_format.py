@@ -130,7 +130,7 @@ def test_rewards_that_were_given_are_given_again(tmp_path):
     agent(PointMass(), reward_fn=reward_fn).learn(12).save(tmp_path / "agent")
     with pytest.raises(UnknownRewardError, match="reward_fn="):
         load(tmp_path / "agent", env=PointMass())
-    assert load(tmp_path / "agent", env=PointMass(), reward_fn=reward_fn).task.reward_fn is reward_fn
+    assert load(tmp_path / "agent", env=PointMass(), reward_fn=reward_fn).task.functions.reward_fn is reward_fn
 
 
 def test_without_an_environment_an_agent_predicts_if_it_is_given_the_reward(saved):
@@ -174,7 +174,7 @@ def test_a_plan_that_no_longer_fits_begins_anew(replaced, saved):
     assert load(saved)._running[0].carried.age == 1
     replaced = {"env": KnownPointMass(), "dynamics": LinearModel(), "planner": planner(), **replaced}
     loaded = MPCAgent.load(saved, **replaced)
-    assert loaded._running[0].carried is loaded.planning.cold
+    assert loaded.collector.running[0].carried is loaded.controller.cold
     assert loaded.learn(LENGTH, reset_num_timesteps=False).num_timesteps == 25 + LENGTH
 
 
@@ -208,7 +208,7 @@ def test_a_termination_function_that_is_given_again_or_not_wanted_needs_no_warni
     parts = {"dynamics": LinearModel(), "planner": planner(), "reward_fn": reward_fn}
     given = MPCAgent.load(saved_with_termination, terminated_fn=Ending.terminated_fn, **parts)
     given.predict(OBSERVATIONS[0])
-    assert given.task.terminated_fn is Ending.terminated_fn
+    assert given.task.functions.terminated_fn is Ending.terminated_fn
     MPCAgent.load(saved_with_termination, terminated_fn="learned", **parts).predict(OBSERVATIONS[0])
     MPCAgent.load(saved, **parts).predict(OBSERVATIONS[0])
     never = KnownPointMass()
@@ -526,9 +526,9 @@ def test_a_file_of_the_second_schema_goes_on():
     path = Path(__file__).parent / "files" / "schema2.zip"
     assert read_checkpoint(path).schema == 2
     loaded = MPCAgent.load(path, env=toy.gymnasium.make("ToyPush-v0"))
-    (running,) = loaded._running
+    (running,) = loaded.collector.running
     assert (running.index, running.has_explored, len(running.record.rewards)) == (2, True, 1)
-    assert not loaded.modelled.reward and loaded.train_freq is None
+    assert not loaded.task.modelled.reward and loaded.train_freq is None
     assert loaded.num_timesteps == len(loaded.store) == 2 * toy.EPISODE_STEPS + 1
     loaded.learn(toy.EPISODE_STEPS, reset_num_timesteps=False)
     assert loaded.store.episodes.unique().tolist() == [0, 1, 2, 3]

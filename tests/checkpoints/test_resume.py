@@ -385,7 +385,7 @@ def test_a_full_disk_ends_the_run_and_leaves_the_checkpoint_before(whole, tmp_pa
 def steps_on_disk(folder):
     with RunCheckpoints(folder) as held:
         checkpoint = held.load()
-    steps = checkpoint.config["counters"]["num_timesteps"]
+    steps = checkpoint.config["values"]["progress"]["num_timesteps"]
     assert len(checkpoint.tensors["transitions"]["reward"]) == steps
     return steps
 

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from gym_dgpmpc import DGPMPCAgent
-from gym_dgpmpc.tasks.task import environment_id, find_observation_spec, find_task, wrapped_env
+from gym_dgpmpc.tasks.environment import environment_id, wrapped_env
+from gym_dgpmpc.tasks.functions import find_functions, find_observation_spec
 from gym_dgpmpc.types import ObservationSpec
 
 pytest.importorskip("gymnasium_robotics")
@@ -35,7 +36,7 @@ def made(env_id):
 def test_they_can_be_planned_for(env_id, spec):
     """The reward that is planned with is the one that `step` returns, and the goal stays for the episode."""
     env = made(env_id)
-    task = find_task(env, None, None, (env.observation_space, env.action_space))
+    task = find_functions(env, None, None, (env.observation_space, env.action_space))
     assert (task.reward_source, find_observation_spec(env, None)) == ("compute_reward", spec)
     assert environment_id(env) == PREFIX + env_id
     env.seed(0)

@@ -126,7 +126,7 @@ class Watch:
             finally:
                 self._memory[0] = 0
             if PHASES[phase] == "checkpointing":
-                self._memory[8:16] = struct.pack("<q", arguments[1].config["counters"]["num_timesteps"])
+                self._memory[8:16] = struct.pack("<q", arguments[1].config["values"]["progress"]["num_timesteps"])
             return result
 
         return told
@@ -223,7 +223,7 @@ def check_nothing_lost(folder, watch):
     found = []
     for name in (run_checkpoints.NEWEST, run_checkpoints.PREVIOUS):
         if (folder / name).exists():
-            found.append(read_checkpoint(folder / name).config["counters"]["num_timesteps"])
+            found.append(read_checkpoint(folder / name).config["values"]["progress"]["num_timesteps"])
     return [] if found and max(found) >= watch.steps else [f"{folder.name}: has {found}, had {watch.steps}"]
 
 

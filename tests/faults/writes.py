@@ -124,7 +124,7 @@ def previous_is_used(folder):
     """Nothing, or how reading a folder with a damaged newest checkpoint went wrong."""
     with RunCheckpoints(folder) as held, warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        steps = held.load().config["counters"]["num_timesteps"]
+        steps = held.load().config["values"]["progress"]["num_timesteps"]
     return [] if steps == 10 and len(warned) == 1 else [f"{steps} steps, {len(warned)} warnings"]
 
 
@@ -158,7 +158,7 @@ def run_full_disk(folder, num_sizes):
                 refused += 1
                 lost += [] if (folder / "agent.zip").read_bytes() == before else [f"{step}: the old one changed"]
                 lost += [str(path) for path in folder.glob(".agent*.tmp")]
-            steps = read_checkpoint(folder / "agent.zip").config["counters"]["num_timesteps"]
+            steps = read_checkpoint(folder / "agent.zip").config["values"]["progress"]["num_timesteps"]
             lost += [] if steps in (15, 18) else [f"{step}: {steps} steps"]
             (folder / "ballast").unlink()
         lost += [] if refused else ["the disk was never full"]
@@ -184,7 +184,7 @@ def _limited_files(source, checkpoint, size, num_sizes):
                     held.save(checkpoint)
             os._exit(0)
         os.waitpid(child, 0)
-        assert read_checkpoint(source / "agent.zip").config["counters"]["num_timesteps"] in (15, 18)
+        assert read_checkpoint(source / "agent.zip").config["values"]["progress"]["num_timesteps"] in (15, 18)
     return "a limit on the size of files", num_sizes
 
 

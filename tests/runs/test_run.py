@@ -66,7 +66,7 @@ def test_the_saved_agent_has_learned_from_every_episode(tmp_path):
 def test_episodes_are_counted_though_they_are_short(tmp_path):
     run = training_run(tmp_path, terminate_at=5)
     run.train(progress_bar=False)
-    assert run.agent.modelled.terminated
+    assert run.agent.task.modelled.terminated
     assert [row.steps for row in run.folder.rows()] == [5, 5, 5]
     assert run.is_complete
     assert DGPMPCAgent.load(run.folder.agent_file).num_fitted == 15
@@ -154,8 +154,8 @@ def test_what_was_finished_survives_a_failure(tmp_path, monkeypatch):
             raise PlanningError("nothing is finite")
         return act(*args, **kwargs)
 
-    act = run.agent.planning.act
-    monkeypatch.setattr(run.agent.planning, "act", fail_from_the_third_episode_on)
+    act = run.agent.controller.act
+    monkeypatch.setattr(run.agent.controller, "act", fail_from_the_third_episode_on)
     with pytest.raises(PlanningError):
         run.train(progress_bar=False)
     assert len(run.folder.rows()) == 2

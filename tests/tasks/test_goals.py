@@ -1,5 +1,7 @@
 """Dict observations as vectors, and environments with goals: read, rewarded, predicted for, saved and resumed."""
 
+import re
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from gym_dgpmpc import DGPMPCAgent, MPCAgent
 from gym_dgpmpc.errors import CheckpointError, EnvironmentDataError
 from gym_dgpmpc.tasks.dict_observations import FlatDict, flatten
-from gym_dgpmpc.tasks.task import find_observation_spec, find_task, wrapped_env
+from gym_dgpmpc.tasks.functions import find_observation_spec, find_task, wrapped_env
 from gym_dgpmpc.types import ObservationSpec
 from tests.agents.point_mass import LENGTH, TIME_STEP, LinearModel, agent, planner
 from tests.agents.test_dgp_mpc import TINY
@@ -102,17 +104,14 @@ def test_an_episodes_last_observation_is_a_vector_too():
 
 
 @pytest.mark.parametrize(
-    ("part", "message"),
-    [
-        (spaces.Box(0, 255, (8, 8, 3), np.uint8), r"Box\(0, 255, \(.*\), uint8\) for 'extra'.*images"),
-        (spaces.Box(-1.0, 1.0, (2, 2), np.float64), r"Box\(-1.0, 1.0, \(2, 2\), float64\) for 'extra'"),
-        (spaces.Discrete(3), r"Discrete\(3\) for 'extra'"),
-    ],
+    "part",
+    [spaces.Box(0, 255, (3, 8, 8), np.uint8), spaces.Box(-1.0, 1.0, (2, 2), np.float64), spaces.Discrete(3)],
+    ids=str,
 )
-def test_parts_that_are_no_vectors_of_reals_are_named(part, message):
+def test_parts_that_are_not_vectors_of_floats_are_named(part):
     env = Goal()
     env.observation_space = spaces.Dict({**env.observation_space.spaces, "extra": part})
-    with pytest.raises(ValueError, match=f"(?s)every part must be a one-dimensional Box of floats, got {message}"):
+    with pytest.raises(ValueError, match=rf"{re.escape(str(part))} for 'extra'"):
         agent(env)
 
 
@@ -136,7 +135,7 @@ def test_compute_reward_is_the_known_reward(vec_env_cls):
         env.close()
 
 
-def test_the_goal_is_constant_and_nothing_feels_it():
+def test_the_goal_is_constant_and_only_the_reward_depends_on_it():
     assert find_observation_spec(wrapped_env(Goal()), None) == ObservationSpec(constant=(1,), not_inputs=(1,))
 
 
@@ -184,11 +183,9 @@ def test_it_goes_to_the_goal():
 def test_a_dict_of_other_parts_is_named(changed):
     parts = {"observation": np.zeros(2), "achieved_goal": np.zeros(1), "desired_goal": np.zeros(1)} | changed
     received = {name: part for name, part in parts.items() if part is not None}
-    expected = (
-        r"a dict of the shapes \{'achieved_goal': \(1,\), 'desired_goal': \(1,\), 'observation': \(2,\)\}, "
-        r"or each with a dimension of n before, got \{"
-    )
-    with pytest.raises(ValueError, match=expected):
+    expected = {"achieved_goal": (1,), "desired_goal": (1,), "observation": (2,)}
+    shapes = {name: part.shape for name, part in received.items()}
+    with pytest.raises(ValueError, match=rf"{re.escape(str(expected))}.*got {re.escape(str(shapes))}"):
         agent(Goal()).predict(received)
 
 
@@ -202,7 +199,7 @@ def test_sb3s_helpers_take_dicts(tmp_path):
     np.testing.assert_array_equal(actions, [action, action])
     assert state[0].shape[0] == 1 and states[0].shape[0] == 2
     assert len(evaluate_policy(learner, Monitor(Goal()), 2, return_episode_rewards=True)[0]) == 2
-    with pytest.raises(ValueError, match=r"expected a dict of .* got \{'observation': \(2,\)\}"):
+    with pytest.raises(ValueError, match=r"got \{'observation': \(2,\)\}"):
         learner.predict({"observation": np.zeros(2)})
     with pytest.raises(EnvironmentDataError, match="not finite"):
         learner.predict({**OBSERVATION, "observation": np.array([np.nan, 0.0])})

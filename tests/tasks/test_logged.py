@@ -51,6 +51,13 @@ def test_arrays_take_the_place_of_the_random_episode():
     assert learner.store.rewards[20:30].sum() > -3.0
 
 
+def test_arrays_with_the_numbers_of_their_episodes():
+    """Whatever the numbers are, the store's go on from those that it has."""
+    data, learner = played(), agent().learn(13)
+    learner.add_transitions({**data, "episode": np.where(np.arange(20) % 2, 7, -3)})
+    assert learner.store.episodes.tolist() == [0] * 10 + [1] * 3 + [2, 3] * 10
+
+
 def test_tensors_and_data_in_the_middle_of_a_run():
     data = {name: torch.as_tensor(value) for name, value in played().items() if name != "terminated"}
     learner = agent().learn(13)
@@ -139,7 +146,7 @@ def test_a_dict_replay_buffer():
     learner = agent(Goal())
     learner.add_transitions(buffer)
     stored = learner.store.transitions()
-    torch.testing.assert_close(learner.task.reward_fn(*stored), learner.store.rewards)
+    torch.testing.assert_close(learner.task.functions.reward_fn(*stored), learner.store.rewards)
     assert len(stored.observation.unique(dim=0)) == 8
     as_arrays = {
         "observation": {key: part[:8, 0] for key, part in buffer.observations.items()},
@@ -181,9 +188,9 @@ def test_a_dataset_of_episodes():
     assert learner.store.terminated.nonzero().flatten().tolist() == [6]
     short = Episodes(data, [7])
     short.episodes[0].observations = short.episodes[0].observations[:-1]
-    with pytest.raises(EnvironmentDataError, match="episode 0 has 7 actions, so it must have 8 observations, got 7"):
+    with pytest.raises(EnvironmentDataError, match=r"episode 0 .*8 observations.* 7 actions, got 7"):
         learner.add_transitions(short)
-    with pytest.raises(EnvironmentDataError, match="no episodes"):
+    with pytest.raises(EnvironmentDataError, match="0 episodes"):
         learner.add_transitions(Episodes(data, []))
 
 
@@ -212,15 +219,18 @@ def test_a_minari_dataset(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"observation": np.zeros((20, 3))}, r"observation must have the shape \[20, 2\].*got \[20, 3\]"),
-        ({"next_observation": np.zeros((19, 2))}, r"next_observation must have the shape \[20, 2\].*got \[19, 2\]"),
-        ({"action": np.zeros(20)}, r"observation must have the shape|action must have the shape \[20, 1\]"),
-        ({"reward": np.zeros((20, 1))}, r"reward must have the shape \[20\].*got \[20, 1\]"),
-        ({"reward": np.full(20, np.nan)}, r"step 0: reward must be finite"),
-        ({"terminated": np.zeros(3, dtype=bool)}, r"terminated must have the shape \[20\].*got \[3\]"),
-        ({"action": np.full((20, 1), 2.5)}, r"within \[-2.0\] and \[2.0\], got 2.5 in component 0 of step 0, and 19"),
+        ({"observation": np.zeros((20, 3))}, r"observation .*\[20, 2\].*got \[20, 3\]"),
+        ({"next_observation": np.zeros((19, 2))}, r"next_observation .*\[20, 2\].*got \[19, 2\]"),
+        ({"action": np.zeros(20)}, r"action .*\[20, 1\].*got \[20\]"),
+        ({"reward": np.zeros((20, 1))}, r"reward .*\[20\].*got \[20, 1\]"),
+        ({"reward": np.full(20, np.nan)}, r"step 0: reward .*got nan"),
+        ({"terminated": np.zeros(3, dtype=bool)}, r"terminated .*\[20\].*got \[3\]"),
+        ({"episode": np.zeros(3, dtype=int)}, r"episode .*\[20\].*got \[3\]"),
+        ({"episode": np.zeros((20, 1), dtype=int)}, r"episode .*\[20\].*got \[20, 1\]"),
+        ({"episode": np.full(20, 0.5)}, r"episode .*float64"),
+        ({"action": np.full((20, 1), 2.5)}, r"\[-2.0\].*\[2.0\], got 2.5 in component 0 of step 0 \(20 "),
         ({"actions": np.zeros((20, 1))}, r"missing: \[\], unknown: \['actions'\]"),
-        ({"observation": np.array([["a", "b"]] * 20)}, r"observation must be numeric"),
+        ({"observation": np.array([["a", "b"]] * 20)}, r"observation .*<U1"),
     ],
 )
 def test_bad_data_are_named_and_nothing_is_stored(change, message):
@@ -235,13 +245,13 @@ def test_missing_fields_and_other_kinds_of_data(unchecked):
     del data["reward"]
     with pytest.raises(EnvironmentDataError, match=r"missing: \['reward'\]"):
         agent().add_transitions(data)
-    with pytest.raises(TypeError, match="ReplayBuffer of Stable-Baselines3 or a Minari dataset, got list"):
+    with pytest.raises(TypeError, match="got list"):
         agent().add_transitions([1, 2])
 
 
 def test_no_data_at_all():
     learner = agent()
-    with pytest.raises(EnvironmentDataError, match="no transitions"):
+    with pytest.raises(EnvironmentDataError, match="0 transitions"):
         learner.add_transitions({name: value[:0] for name, value in played().items()})
     assert learner.is_exploring
 

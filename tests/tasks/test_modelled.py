@@ -11,7 +11,7 @@ from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import CheckpointError, UnknownRewardError
 from gym_dgpmpc.planning.rollout import particle_returns
 from gym_dgpmpc.tasks.modelled import ModelledVector
-from gym_dgpmpc.tasks.task import Task
+from gym_dgpmpc.tasks.functions import TaskFunctions
 from gym_dgpmpc.types import ObservationSpec
 from tests.agents.point_mass import LENGTH, KnownPointMass, LinearModel, PointMass, actions_of, agent, planner
 from tests.agents.test_dgp_mpc import TINY
@@ -81,24 +81,24 @@ class TestVector:
         after = torch.tensor([[0.0, 0.0, 1.3, 7.0, 0.6], [2.0, 0.0, 0.0, 8.0, 0.4]])
         before, action = torch.zeros(2, 5), torch.ones(2, 1)
         vector = ModelledVector(3, self.spec, reward=True, terminated=True)
-        learned = vector.task(Task(None, None, "learned", "learned"))
+        learned = vector.functions(TaskFunctions(None, None, "learned", "learned"))
         assert learned.reward_fn(before, action, after).tolist() == [7.0, 8.0]
         assert learned.terminated_fn(after).tolist() == [True, False]
-        known = vector.task(Task(lambda o, a, n: o.sum(-1) + a.sum(-1) + n.sum(-1), far))
+        known = vector.functions(TaskFunctions(lambda o, a, n: o.sum(-1) + a.sum(-1) + n.sum(-1), far))
         assert known.reward_fn(before, action, after).tolist() == pytest.approx([2.3, 3.0])
         assert known.terminated_fn(after).tolist() == [False, True]
-        assert vector.task(Task(None, None, "learned", "never")).terminated_fn is None
-        plain = Task(far, far)
+        assert vector.functions(TaskFunctions(None, None, "learned", "never")).terminated_fn is None
+        plain = TaskFunctions(far, far)
         assert ModelledVector(3, self.spec).task(plain) == plain
-        with pytest.raises(ValueError, match="neither known"):
-            ModelledVector(3, self.spec).task(Task(None, None, "learned"))
+        with pytest.raises(ValueError, match="got neither"):
+            ModelledVector(3, self.spec).functions(TaskFunctions(None, None, "learned"))
 
 
 def test_a_learned_reward_scores_as_the_known_one_does():
     """For plans from a state: the linear model knows either exactly, up to its particles' spread of 1e-3 per step."""
     env = Linear(fixed_start=True)
     learner = agent(env, dynamics=linear).learn(3 * LENGTH)
-    assert learner.task.reward_source == "learned" and learner.modelled.reward
+    assert learner.task.functions.reward_source == "learned" and learner.task.modelled.reward
     states, actions = [torch.zeros(5, 8, 3)], torch.linspace(-2, 2, 40).reshape(8, 5, 1)
     states[0][..., 0] = 0.7
     with torch.no_grad():
@@ -106,7 +106,7 @@ def test_a_learned_reward_scores_as_the_known_one_does():
         for step in range(5):
             states.append(sampler(states[-1], actions[:, step], step))
     states = torch.stack(states)
-    predicted = particle_returns(states, actions, learner.modelled.task(learner.task).reward_fn)
+    predicted = particle_returns(states, actions, learner.task.modelled.task(learner.task).reward_fn)
     known = particle_returns(states, actions, lambda o, a, n: -n[..., 0])
     # Five steps, each off by the spread times the size of its inputs (1, velocity and force, below 4) at 4 sigma.
     torch.testing.assert_close(predicted, known, rtol=0, atol=5 * 4 * 4e-3)
@@ -128,7 +128,7 @@ def test_with_a_learned_reward_it_acts_as_with_the_known_one():
 def test_the_end_is_worth_what_the_rest_of_the_episode_is_not(slope, pay, shuns_the_end):
     """A plan's return over the horizon, by the predicted numbers alone, against the plan that ends it at once."""
     vector = ModelledVector(1, ObservationSpec(), reward=True, terminated=True)
-    functions = vector.task(Task(None, None, "learned", "learned"))
+    functions = vector.functions(TaskFunctions(None, None, "learned", "learned"))
     horizon = 6
     stays = torch.full((horizon + 1, 1, 1, 3), 1.0)
     stays[..., 1], stays[..., 2] = slope, 0.02
@@ -167,7 +167,7 @@ def test_deep_gp_learns_when_an_episode_ends_and_keeps_it_from_ending():
     sizes = {"num_inducing": 15, "first_training_iterations": 200, "training_iterations": 25, "num_layers": 1}
     learner = DGPMPCAgent(Balance(), **{**TINY, **sizes, "learning_starts": 60, "horizon": 6, "resample_steps": 0})
     learner.learn(145)
-    assert learner.modelled.reward and learner.modelled.terminated
+    assert learner.task.modelled.reward and learner.task.modelled.terminated
     assert learner.dynamics.encoder.target_size == 3 and learner.dynamics.encoder.input_size == 2
     lengths = torch.bincount(learner.store.episodes)
     explored = len(torch.unique(learner.store.episodes[:60]))
@@ -197,7 +197,7 @@ NETWORKS = {"hidden_size": 16, "num_hidden_layers": 1, "weight_decay": (1e-4, 1e
 )
 def test_every_model_learns_them(agent_class, arguments, tmp_path):
     learner = agent_class(Balance(), **BASELINE, **arguments).learn(58)
-    assert learner.modelled.reward and learner.modelled.terminated
+    assert learner.task.modelled.reward and learner.task.modelled.terminated
     assert (learner.dynamics.encoder.input_size, learner.dynamics.encoder.target_size) == (2, 3)
     if agent_class is GPMPCAgent:  # which is good at it
         assert torch.bincount(learner.store.episodes)[-1] > 12
@@ -215,10 +215,10 @@ def test_an_agent_that_learned_its_reward_is_saved_and_goes_on(draw, tmp_path):
     whole, part = made(), made()
     whole.learn(40)
     part.learn(31)
-    assert part.modelled.terminated
+    assert part.task.modelled.terminated
     part.save(tmp_path / "part")
     loaded = DGPMPCAgent.load(tmp_path / "part", env=part.env, force_reset=False)
-    assert loaded.modelled == part.modelled
+    assert loaded.task.modelled == part.task.modelled
     alone = DGPMPCAgent.load(tmp_path / "part")
     for one in (loaded, alone):
         expected = part.predict(np.array([0.1]), deterministic=True)[0]
@@ -250,14 +250,14 @@ def test_the_first_termination_makes_the_model_begin_anew():
 
     env = KnownPointMass(fixed_start=True)
     learner = agent(env, dynamics=factory).learn(2 * LENGTH)
-    assert made == [(2, ObservationSpec())] and not learner.modelled.terminated
+    assert made == [(2, ObservationSpec())] and not learner.task.modelled.terminated
     before = learner.dynamics
     env.terminate_beyond = 1.05
     env.state = np.array([1.0, 0.0])
     learner.learn(LENGTH, callback=lambda locals_, _: env.state.__setitem__(1, 2.0) is None)
     assert learner.store.terminated.any()
     assert made == [(2, ObservationSpec()), (3, ObservationSpec(absolute=(2,), not_inputs=(2,)))]
-    assert learner.dynamics is not before and learner.planning.dynamics is learner.dynamics
+    assert learner.dynamics is not before and learner.controller.dynamics is learner.dynamics
     assert learner.dynamics.fits[0] == int(learner.store.terminated.nonzero()[0]) + 1
 
 
@@ -282,9 +282,9 @@ def test_what_was_asked_to_be_learned_stays_so(tmp_path):
     learner.save(tmp_path / "agent")
     parts = {"dynamics": linear, "planner": planner()}
     loaded = MPCAgent.load(tmp_path / "agent", env=KnownPointMass(), **parts)
-    assert loaded.task.reward_source == "learned" and loaded.modelled.reward
+    assert loaded.task.functions.reward_source == "learned" and loaded.task.modelled.reward
     known = MPCAgent.load(tmp_path / "agent", env=KnownPointMass(), reward_fn=None, **parts)
-    assert known.task.reward_source == "the environment's" and known.modelled.reward
+    assert known.task.functions.reward_source == "the environment's" and known.task.modelled.reward
     known.predict(np.zeros(2))
     learner.learn(LENGTH, run_folder=tmp_path / "run")
     with pytest.raises(CheckpointError, match="what was to be learned was"):
@@ -294,7 +294,7 @@ def test_what_was_asked_to_be_learned_stays_so(tmp_path):
 def test_set_env_learns_a_reward_only_before_the_model_is_trained():
     learner = agent(KnownPointMass(), dynamics=linear)
     learner.set_env(Linear())
-    assert learner.modelled.reward and learner.learn(12).is_fitted
+    assert learner.task.modelled.reward and learner.learn(12).is_fitted
     trained = agent(KnownPointMass(), dynamics=linear).learn(12)
     with pytest.raises(UnknownRewardError, match="Linear"):
         trained.set_env(Linear())
@@ -307,4 +307,4 @@ def test_set_env_learns_a_reward_only_before_the_model_is_trained():
 def test_gymnasiums_own_tasks_work_at_once(env_id, reward_fn, sizes):
     learner = DGPMPCAgent(env_id, reward_fn=reward_fn, **{**TINY, "num_layers": 1, "learning_starts": 25}).learn(28)
     assert (learner.dynamics.encoder.input_size, learner.dynamics.encoder.target_size) == sizes
-    assert learner.modelled.reward == (reward_fn == "learned") and not learner.modelled.terminated
+    assert learner.task.modelled.reward == (reward_fn == "learned") and not learner.task.modelled.terminated

@@ -17,17 +17,17 @@ def guard_warnings(learner, steps=LENGTH + 3):
     return [str(each.message) for each in caught if "disagrees" in str(each.message)]
 
 
-def test_functions_that_agree_say_nothing():
+def test_functions_that_agree_do_not_warn():
     ended = KnownPointMass(terminate_beyond=1.2)
     assert guard_warnings(agent()) == []
     assert guard_warnings(agent(ended, terminated_fn=lambda after: after[..., 0].abs() > 1.2), 25) == []
 
 
-def test_a_reward_that_disagrees_is_told_once_with_its_numbers():
+def test_a_reward_that_disagrees_warns_once_with_its_numbers():
     learner = agent(reward_fn=lambda o, a, n: reward_fn(o, a, n) + 0.5 * (o[..., 1] == 0))
     (message,) = guard_warnings(learner, 25)
     stored = learner.store.rewards[0].item()
-    assert "reward_fn disagrees with what the environment returned in 1 of 10 transitions, most at number 0" in message
+    assert "1 of 10 transitions" in message and "transition 0" in message
     assert f"reward_fn gives {stored + 0.5:.6g}, the environment returned {stored:.6g}." in message
 
 
@@ -52,7 +52,7 @@ def test_a_termination_that_disagrees():
 def test_a_reward_that_is_meant_to_be_another_is_not_compared(penalise_step):
     env = RiskSensitiveReward(KnownPointMass(), angle_index=0, angle_step=0.1, penalise_step=penalise_step)
     learner = agent(env)
-    assert learner.task.is_reported == penalise_step
+    assert learner.task.functions.is_reported == penalise_step
     assert guard_warnings(learner) == []
     # The same wrapper, not saying that its rewards differ.
     other = RiskSensitiveReward(KnownPointMass(), angle_index=0, angle_step=0.1, penalise_step=penalise_step)
@@ -62,8 +62,8 @@ def test_a_reward_that_is_meant_to_be_another_is_not_compared(penalise_step):
 
 def test_a_shaped_reward_is_not_compared_and_a_given_one_is():
     shaped = agent(gymnasium.make("InvertedPendulum-v5"), reward_fn=None)
-    assert not shaped.task.is_reported
+    assert not shaped.task.functions.is_reported
     assert guard_warnings(shaped) == []
-    given = agent(gymnasium.make("InvertedPendulum-v5"), reward_fn=shaped.task.reward_fn)
+    given = agent(gymnasium.make("InvertedPendulum-v5"), reward_fn=shaped.task.functions.reward_fn)
     (message,) = guard_warnings(given)
     assert "the environment returned 1" in message

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 
 import gym_dgpmpc  # noqa: F401  # registers the environments
 from gym_dgpmpc.envs.known_rewards import PendulumReward
-from gym_dgpmpc.tasks.task import find_observation_spec, find_task, wrapped_env
+from gym_dgpmpc.tasks.functions import find_observation_spec, find_task, wrapped_env
 from gym_dgpmpc.types import ObservationSpec
 from gym_dgpmpc.wrappers import RiskSensitiveReward
 from tests.agents.point_mass import KnownPointMass, PointMass, agent, reward_fn
