@@ -370,6 +370,11 @@ class MPCAgent(BaseAlgorithm):
         return self.num_fitted > 0
 
     @property
+    def has_running_episode(self) -> bool:
+        """Whether `learn` can go on where the environments are."""
+        return self._last_obs is not None
+
+    @property
     def is_exploring(self) -> bool:
         """Whether the next actions are random because there are too few transitions to learn from."""
         if self.is_fitted:

@@ -5,18 +5,47 @@ to import is imported when a command runs, so that `--help` answers at once.
 """
 
 import importlib.metadata
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
+from typer.main import get_command
 
 import gym_dgpmpc  # noqa: F401  # registers the environments
 from gym_dgpmpc.bench.report_command import report
 from gym_dgpmpc.cli import bench, evaluate, train
 
-COMMANDS = (train.train, evaluate.evaluate, bench.bench, report)
+
+def _train() -> None:
+    """Stands for `train.train` until that is called."""
+
+
+_train.__doc__ = train.train.__doc__
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "train": _train,
+    "evaluate": evaluate.evaluate,
+    "bench": bench.bench,
+    "report": report,
+}
 """In the order in which `dgpmpc --help` shows them."""
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+class _Commands(TyperGroup):
+    """Gives `train` its options when it is called, for they are read from the agent, whose import takes seconds."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] == "train":
+            from gym_dgpmpc.cli.options import with_settings
+
+            complete = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+            complete.command("train")(with_settings(train.train))
+            self.commands["train"] = get_command(complete)
+        return super().resolve_command(ctx, args)
+
+
+app = typer.Typer(cls=_Commands, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 
 def _show_version(value: bool) -> bool:
@@ -35,5 +64,5 @@ def main(
     """Sample-efficient model-predictive control with deep Gaussian processes."""
 
 
-for command in COMMANDS:
-    app.command()(command)
+for name, command in COMMANDS.items():
+    app.command(name)(command)

@@ -5,8 +5,6 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from enum import Enum
-from typing import Any
 
 import gymnasium
 import typer
@@ -31,11 +29,6 @@ def _where(error: Exception) -> str:
     """Kind and place of an error that says nothing, such as a bare assertion in an environment."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__} at {last.filename}:{last.lineno}: {last.line}"
-
-
-def plain(**arguments: Any) -> dict[str, Any]:
-    """The arguments with choices as texts."""
-    return {name: value.value if isinstance(value, Enum) else value for name, value in arguments.items()}
 
 
 def use_threads(threads: int) -> None:

@@ -1,6 +1,5 @@
 """`dgpmpc train ENV_ID`."""
 
-import inspect
 import os
 import time
 from functools import partial
@@ -10,16 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import gymnasium
 import typer
 
-from gym_dgpmpc import options
 from gym_dgpmpc.cli.common import (
     EXIT_INTERRUPTED,
     EXIT_TERMINATED,
     make,
     one_line_errors,
-    plain,
     prepare_video,
     use_threads,
 )
+from gym_dgpmpc.settings import refuse_unknown
 
 if TYPE_CHECKING:
     from gym_dgpmpc.runs.run import TrainingRun
@@ -80,65 +78,22 @@ def train(
             min=1, help="Steps between checkpoints within an episode, beside those at its end.", rich_help_panel=RUN
         ),
     ] = None,
-    num_layers: options.NumLayers = None,
-    kernel: options.Kernel = None,
-    num_inducing: options.NumInducing = None,
-    draw: options.Draw = None,
-    refresh: options.Refresh = None,
-    num_features: options.NumFeatures = None,
-    num_particles: options.NumParticles = None,
-    horizon: options.Horizon = None,
-    num_candidates: options.NumCandidates = None,
-    num_elites: options.NumElites = None,
-    num_iterations: options.NumIterations = None,
-    actions_per_plan: options.ActionsPerPlan = None,
-    time_budget: options.TimeBudget = None,
-    learning_starts: options.LearningStarts = None,
-    train_freq: options.TrainFreq = None,
-    first_training_iterations: options.FirstTraining = None,
-    training_iterations: options.Training = None,
-    num_samples: options.NumSamples = None,
-    sample_spacing: options.SampleSpacing = None,
-    resample_steps: options.Resample = None,
-    reward_fn: options.Reward = None,
-    terminated_fn: options.Termination = None,
+    *,
+    asked: dict[str, Any],
 ) -> None:
     """Train an agent, and leave results, pictures and the agent itself in a folder.
 
     Options that are not given are as in the preset for ENV_ID (the paper's if it has one), else the agent's defaults.
     """
-    asked = plain(
-        num_layers=num_layers,
-        kernel=kernel,
-        num_inducing=num_inducing,
-        draw=draw,
-        refresh=refresh,
-        num_features=num_features,
-        num_particles=num_particles,
-        horizon=horizon,
-        num_candidates=num_candidates,
-        num_elites=num_elites,
-        num_iterations=num_iterations,
-        actions_per_plan=actions_per_plan,
-        time_budget=time_budget,
-        learning_starts=learning_starts,
-        train_freq=train_freq,
-        first_training_iterations=first_training_iterations,
-        training_iterations=training_iterations,
-        num_samples=num_samples,
-        sample_spacing=sample_spacing,
-        resample_steps=resample_steps,
-        reward_fn=reward_fn,
-        terminated_fn=terminated_fn,
-        seed=seed,
-    )
+    with one_line_errors(ValueError, TypeError):
+        arguments = _fill_in(env_id, {**asked, "seed": seed})
     with one_line_errors(ValueError, AssertionError, OSError):
         if episodes is not None and timesteps is not None:
             raise ValueError("give either --episodes or --timesteps, not both")
         use_threads(threads)
         no_video = prepare_video(env_id) if video else "--no-video was given"
         env = make(env_id, render=not no_video)
-        run = _set_up_run(env, asked, out, overwrite, episodes, timesteps, checkpoint_every)
+        run = _set_up_run(env, arguments, out, overwrite, episodes, timesteps, checkpoint_every)
     if run.is_complete:
         typer.echo(f"{run.folder.path} holds this run already, finished: ask for more --episodes, or --overwrite it")
         return
@@ -164,20 +119,19 @@ def train(
 
 def _set_up_run(
     env: gymnasium.Env,
-    asked: dict[str, Any],
+    arguments: dict[str, Any],
     out: Path | None,
     overwrite: bool,
     episodes: int | None,
     timesteps: int | None,
     checkpoint_every: int | None,
 ) -> "TrainingRun":
-    """The run that the options describe, with what they leave open filled in."""
+    """The run that the options describe."""
     from gym_dgpmpc.agents import DGPMPCAgent
     from gym_dgpmpc.runs.run import RunFolder, TrainingRun, step_limit
 
     assert env.spec is not None
     env_id, max_steps = env.spec.id, env.spec.max_episode_steps
-    arguments = _fill_in(env_id, asked)
     if timesteps is None:
         if max_steps is None:
             raise ValueError(f"episodes of {env_id} have no time limit and may never end: give --timesteps")
@@ -185,7 +139,8 @@ def _set_up_run(
         timesteps = step_limit(episodes, max_steps, arguments["learning_starts"])
     folder = RunFolder(
         out or Path("runs") / f"{env_id}-seed{arguments['seed']}",
-        {"environment": env_id, **arguments},
+        {"environment": env_id, **_identifying(arguments)},
+        defaults=_identifying(_fill_in(env_id, dict.fromkeys(arguments) | {"planner": arguments["planner"]})),
         overwrite=overwrite,
     )
     try:
@@ -206,16 +161,32 @@ def _set_up_run(
 
 
 def _fill_in(env_id: str, asked: dict[str, Any]) -> dict[str, Any]:
-    """Every argument as asked, else as in the preset for the environment, else as the agent has it."""
+    """Every argument as asked, else as in the preset for the environment, else as the agent has it.
+
+    Raises:
+        TypeError: a setting of another planner is asked for.
+    """
     from gym_dgpmpc.agents import DGPMPCAgent
     from gym_dgpmpc.agents.presets import settings_for
 
-    parameters = inspect.signature(DGPMPCAgent).parameters
-    filled = {name: parameters[name].default for name in asked}
-    filled |= settings_for(env_id)
-    if asked["num_candidates"] is not None:
+    given = {name: value for name, value in asked.items() if value is not None}
+    planner = given.setdefault("planner", "cem")
+    known = {**DGPMPCAgent.own_settings(), **DGPMPCAgent.part_settings(planner)}
+    others = {"planner", "reward_fn", "terminated_fn"}
+    refuse_unknown(f"an agent that plans by {planner}", given, {*known, *others})
+    filled = {name: known[name].default if name in known else None for name in asked if name in {*known, *others}}
+    filled |= {name: value for name, value in settings_for(env_id).items() if name in known}
+    if "num_candidates" in given and "num_elites" in filled:
         filled["num_elites"] = None  # the preset's elites are a part of the preset's candidates
-    return filled | {name: value for name, value in asked.items() if value is not None}
+    return filled | given
+
+
+def _identifying(arguments: dict[str, Any]) -> dict[str, Any]:
+    """The arguments that make a run another one: not those that the machine decides."""
+    from gym_dgpmpc.agents import DGPMPCAgent
+
+    settings = DGPMPCAgent.part_settings(arguments["planner"])
+    return {name: value for name, value in arguments.items() if name not in settings or settings[name].is_saved}
 
 
 def _summarise(run: "TrainingRun", seconds: float) -> None:

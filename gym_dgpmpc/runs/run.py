@@ -9,9 +9,10 @@ import csv
 import io
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -83,6 +84,7 @@ class RunFolder:
     Args:
         path: the folder; made if there is none.
         settings: what identifies the run: going on with another run's folder is refused.
+        defaults: what a setting was in a run that began before there was such a setting.
         overwrite: begin anew even if the folder holds a run.
         otherwise: what the error over another run's folder advises.
 
@@ -97,10 +99,12 @@ class RunFolder:
         path: Path,
         settings: dict[str, Any],
         *,
+        defaults: Mapping[str, Any] = MappingProxyType({}),
         overwrite: bool = False,
         otherwise: str = "choose another folder with --out, or --overwrite to begin anew",
     ):
         self.path, self.settings = path, json.loads(json.dumps(settings))
+        self._defaults = json.loads(json.dumps(dict(defaults)))
         self._otherwise = otherwise
         self.checkpoints = RunCheckpoints(path)
         self.agent_file, self.episodes_file = self.checkpoints.newest, path / EPISODES_FILE
@@ -153,7 +157,7 @@ class RunFolder:
 
     def _refuse_other_settings(self) -> None:
         try:
-            before = self.read_settings()["settings"]
+            before = {**self._defaults, **self.read_settings()["settings"]}
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise RunFolderError(f"{self.path} holds an agent without readable {SETTINGS_FILE}: {error}") from error
         differing = [
@@ -220,7 +224,7 @@ class TrainingRun:
         if resume_from(self.agent, folder.checkpoints):
             # An episode whose row was written but whose agent was not saved will be played again.
             rows = [row for row in folder.rows() if row.total_steps <= self.agent.num_timesteps]
-            if num_episodes is not None and self.agent._last_obs is None:
+            if num_episodes is not None and not self.agent.has_running_episode:
                 # A new episode begins. Steps of those given up, which have no row, cost none of the episodes asked for.
                 self.total_timesteps += self.agent.num_timesteps - sum(row.steps for row in rows)
         folder.write_rows(rows)

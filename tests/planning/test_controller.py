@@ -12,7 +12,7 @@ from gymnasium import spaces
 from gym_dgpmpc.errors import PlanningError
 from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.plan_state import pack, unpack
-from gym_dgpmpc.tasks.task import Task
+from gym_dgpmpc.tasks.task import Task, TaskArguments
 from gym_dgpmpc.types import PlanInfo
 from tests.planning.test_planner_contract import FACTORIES
 from tests.planning.toy_planners import RandomShooting, Sequence
@@ -49,7 +49,7 @@ def distance(observation, action, next_observation):
     return -next_observation[..., 0].abs()
 
 
-TASK = Task(distance, None, "given", "given")
+TASK = Task(None, spaces.Box(-9.0, 9.0, (1,)), SPACE, TaskArguments(distance, None, None), torch.device("cpu"))
 
 
 def controller(name="one sequence", **arguments):

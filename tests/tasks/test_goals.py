@@ -16,7 +16,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from gym_dgpmpc import DGPMPCAgent, MPCAgent
 from gym_dgpmpc.errors import CheckpointError, EnvironmentDataError
 from gym_dgpmpc.tasks.dict_observations import FlatDict, flatten
-from gym_dgpmpc.tasks.functions import find_observation_spec, find_task, wrapped_env
+from gym_dgpmpc.tasks.environment import wrapped_env
+from gym_dgpmpc.tasks.functions import find_functions, find_observation_spec
 from gym_dgpmpc.types import ObservationSpec
 from tests.agents.point_mass import LENGTH, TIME_STEP, LinearModel, agent, planner
 from tests.agents.test_dgp_mpc import TINY
@@ -119,7 +120,7 @@ def test_parts_that_are_not_vectors_of_floats_are_named(part):
 def test_compute_reward_is_the_known_reward(vec_env_cls):
     env = wrapped_env(make_vec_env(Goal, n_envs=1, vec_env_cls=vec_env_cls))
     try:
-        task = find_task(env, None, None, (env.observation_space, env.action_space))
+        task = find_functions(env, None, None, (env.observation_space, env.action_space))
         assert task.reward_source == "compute_reward"
         observation = env.reset()
         for action in np.linspace(-2, 2, 5, dtype=np.float32):

@@ -10,8 +10,8 @@ from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import CheckpointError, UnknownRewardError
 from gym_dgpmpc.planning.rollout import particle_returns
-from gym_dgpmpc.tasks.modelled import ModelledVector
 from gym_dgpmpc.tasks.functions import TaskFunctions
+from gym_dgpmpc.tasks.modelled import ModelledVector
 from gym_dgpmpc.types import ObservationSpec
 from tests.agents.point_mass import LENGTH, KnownPointMass, LinearModel, PointMass, actions_of, agent, planner
 from tests.agents.test_dgp_mpc import TINY

@@ -10,7 +10,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 
 import gym_dgpmpc  # noqa: F401  # registers the environments
 from gym_dgpmpc.envs.known_rewards import PendulumReward
-from gym_dgpmpc.tasks.functions import find_observation_spec, find_task, wrapped_env
+from gym_dgpmpc.tasks.environment import wrapped_env
+from gym_dgpmpc.tasks.functions import find_functions, find_observation_spec
 from gym_dgpmpc.types import ObservationSpec
 from gym_dgpmpc.wrappers import RiskSensitiveReward
 from tests.agents.point_mass import KnownPointMass, PointMass, agent, reward_fn
@@ -18,7 +19,7 @@ from tests.agents.point_mass import KnownPointMass, PointMass, agent, reward_fn
 
 def found(env, reward_fn=None, terminated_fn=None):
     env = wrapped_env(env)
-    return find_task(env, reward_fn, terminated_fn, (env.observation_space, env.action_space))
+    return find_functions(env, reward_fn, terminated_fn, (env.observation_space, env.action_space))
 
 
 def sources(*arguments, **settings):
@@ -63,9 +64,9 @@ def test_what_the_user_says_goes_first(unchecked):
     assert sources(env, "learned", "learned") == ("learned", "learned")
     assert sources(env, "learned") == ("learned", "never")
     with pytest.raises(ValueError, match="reward_fn must be a function, \"learned\" or None, got 'guessed'"):
-        find_task(None, "guessed", None, (env.observation_space, env.action_space))
+        find_functions(None, "guessed", None, (env.observation_space, env.action_space))
     with pytest.raises(ValueError, match="terminated_fn must be a function"):
-        find_task(None, "learned", "guessed", (env.observation_space, env.action_space))
+        find_functions(None, "learned", "guessed", (env.observation_space, env.action_space))
 
 
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])

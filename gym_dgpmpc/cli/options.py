@@ -1,0 +1,107 @@
+"""The options of `dgpmpc train` that set the agent's arguments, made from the settings of the agent's parts.
+
+An option is called as its setting is, with dashes, and without "num-" too where the name begins so: ``--num-layers``,
+``--layers``. It is None unless it is given, so that the environment's preset or the part's own default takes effect.
+Reading the settings imports PyTorch; `cli/__init__.py` does so only when `dgpmpc train` runs.
+"""
+
+import inspect
+import types
+from collections.abc import Callable, Iterable
+from enum import Enum
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import typer
+
+from gym_dgpmpc.agents import DGPMPCAgent, presets
+from gym_dgpmpc.gp.kernels import KERNELS
+from gym_dgpmpc.planning.registry import PLANNERS, planner_factory
+from gym_dgpmpc.settings import Setting, settings_of
+from gym_dgpmpc.tasks.functions import LEARNED
+
+SET_BY_THE_RUN = {"seed", "verbose", "tensorboard_log", "stats_window_size", "observation_spec"}
+"""Settings of the agent that are no options: the run has them, or they are not plain values."""
+
+PLANNER_TEXT = "The optimiser of action sequences."
+SOURCE_TEXTS = {
+    "reward_fn": "Whether the model learns to predict the reward, even where it is known.",
+    "terminated_fn": "Whether the model learns to predict an episode's end, even where it is known.",
+}
+CHOICES = {"kernel": tuple(KERNELS)}
+"""What a setting may be whose annotation does not say it."""
+
+
+def with_settings(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with an option for each setting; it is called with those, by name, in its ``asked``."""
+
+    def with_options(**given: Any) -> None:
+        asked = {name: _plain(given.pop(name)) for name in names}
+        command(**given, asked=asked)
+
+    own = [p for p in inspect.signature(command).parameters.values() if p.name != "asked"]
+    options = list(_options())
+    names = [option.name for option in options]
+    with_options.__doc__ = command.__doc__
+    with_options.__name__ = command.__name__
+    with_options.__signature__ = inspect.Signature([*own, *options])  # type: ignore[attr-defined]
+    with_options.__annotations__ = {p.name: p.annotation for p in (*own, *options)}
+    return with_options
+
+
+def _options() -> Iterable[inspect.Parameter]:
+    seen: set[str] = set()
+    own, model = DGPMPCAgent.own_settings(), settings_of(DGPMPCAgent.dynamics_class)
+    groups = [("Model", model), ("Planner", {n: s for n, s in own.items() if n in _PLANNING})]
+    groups += [("Planner", settings_of(planner_factory(name))) for name in PLANNERS]
+    groups += [("Training", {n: s for n, s in own.items() if n not in _PLANNING})]
+    yield _option("planner", _choice("planner", tuple(PLANNERS)), PLANNER_TEXT, "cem", "Planner")
+    for panel, settings in groups:
+        for setting in settings.values():
+            kind = _kind(setting)
+            if setting.name not in seen | SET_BY_THE_RUN and kind is not None:
+                seen.add(setting.name)
+                yield _option(setting.name, kind, setting.text, _default(setting), panel)
+    for name, text in SOURCE_TEXTS.items():
+        yield _option(name, _choice(name, (LEARNED,)), text, "what is known; else learned", "Task")
+
+
+_PLANNING = ("num_particles", "actions_per_plan", "time_budget")
+
+
+def _option(name: str, kind: Any, text: str, default: str | bool, panel: str) -> inspect.Parameter:
+    dashed = name.replace("_", "-")
+    names = [f"--{dashed}", *([f"--{dashed.removeprefix('num-')}"] if dashed.startswith("num-") else [])]
+    if kind is bool:
+        names = [f"--{dashed}/--no-{dashed}"]
+    option = typer.Option(*names, help=text[:1].upper() + text[1:], show_default=default, rich_help_panel=panel)
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind | None, option]
+    )
+
+
+def _kind(setting: Setting) -> Any:
+    """The type of an option, or None if the setting is not a plain value."""
+    if setting.name in CHOICES:
+        return _choice(setting.name, CHOICES[setting.name])
+    annotation = setting.annotation
+    if get_origin(annotation) in (Union, types.UnionType):
+        kinds = [each for each in get_args(annotation) if each is not type(None)]
+        annotation = kinds[0] if len(kinds) == 1 else None
+    if get_origin(annotation) is Literal:
+        return _choice(setting.name, get_args(annotation))
+    return annotation if annotation in (int, float, bool, str) else None
+
+
+def _choice(name: str, choices: Iterable[str]) -> Any:
+    return Enum(name, {choice: choice for choice in choices}, type=str)
+
+
+def _default(setting: Setting) -> str | bool:
+    """What holds if the option is not given, for a person; False where the text says it."""
+    is_preset = any(setting.name in preset for preset in (*presets.PAPER.values(), *presets.STOCK.values()))
+    texts = [] if setting.default is None else [str(setting.default)]
+    return " or ".join([*texts, *(["the preset's for ENV_ID"] if is_preset else [])]) or False
+
+
+def _plain(value: Any) -> Any:
+    return value.value if isinstance(value, Enum) else value
