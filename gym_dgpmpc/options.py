@@ -12,6 +12,7 @@ import typer
 
 class KernelName(str, Enum):
     rbf = "rbf"
+    matern72 = "matern72"
     matern52 = "matern52"
     matern32 = "matern32"
     matern12 = "matern12"

@@ -13,7 +13,6 @@ from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.agents.parts import cem_planner
 from gym_dgpmpc.dynamics.deep_gp.draws import Draw, Refresh
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
-from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.tasks.task import Learned
 from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
 
@@ -185,14 +184,14 @@ class DGPMPCAgent(MPCAgent):
             draw=self.draw,
             refresh=self.refresh,
             num_features=self.num_features,
-            first_iterations=self.first_training_iterations,
-            iterations=self.training_iterations,
+            first_training_iterations=self.first_training_iterations,
+            training_iterations=self.training_iterations,
             num_samples=self.num_samples,
             sample_spacing=self.sample_spacing,
             resample_steps=self.resample_steps,
-            inference=InferenceSettings(
-                step_size=self.step_size, batch_size=self.batch_size, gibbs_every=self.gibbs_every
-            ),
+            step_size=self.step_size,
+            batch_size=self.batch_size,
+            gibbs_every=self.gibbs_every,
             compile=self.compile,
             device=self.device,
         )

@@ -162,7 +162,7 @@ class GPMPCAgent(MPCAgent):
             kernel=self.kernel,
             num_inducing=self.num_inducing,
             exact=self.exact,
-            max_iterations=self.max_training_iterations,
+            max_training_iterations=self.max_training_iterations,
             draw=self.draw,
             add_noise=self.add_noise,
             update_within_episode=self.update_within_episode,

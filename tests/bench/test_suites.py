@@ -10,9 +10,9 @@ import pytest
 from gym_dgpmpc.agents.presets import COMPARISON_PETS, PAPER, PETS
 from gym_dgpmpc.bench.methods import METHODS
 from gym_dgpmpc.bench.paper import EPISODES as PAPER_TASKS
+from gym_dgpmpc.bench.paper import KERNELS
 from gym_dgpmpc.bench.suites import SUITES, Narrowed, SuiteError, find_suite
 from gym_dgpmpc.bench.tasks import TASKS
-from gym_dgpmpc.gp.kernels import KERNELS
 
 ALL = Narrowed()
 RUN_SUITES = ("table", "comparison", "variance", "unmodified", "long-cheetah", "stock")
@@ -49,7 +49,9 @@ def test_the_command_of_a_run_makes_that_run(name):
 def test_the_table_is_12_settings_on_3_tasks_with_10_seeds():
     runs = jobs("table")
     cells = Counter((run.task.name, run.settings["num_layers"], run.settings["kernel"]) for run in runs)
-    assert set(cells) == {(task, layers, kernel) for task in PAPER_TASKS for layers in (1, 2, 3) for kernel in KERNELS}
+    assert set(cells) == {
+        (task, layers, kernel) for task in PAPER_TASKS for layers in (1, 2, 3) for kernel in paper.KERNELS
+    }
     assert set(cells.values()) == {10}
     for run in runs:
         assert run.episodes == (10 if "Cheetah" in run.task.name else 15)

@@ -1,7 +1,7 @@
 """An ensemble of probabilistic networks as pure functions of its parameters, all members in one batched product.
 
 Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials using Probabilistic Dynamics Models", with the
-initial values, bounds and losses of their published code. `ensemble.py` trains it and draws from it.
+initial values, bounds and losses of their published code. `model.py` trains it and draws from it.
 """
 
 from collections.abc import Sequence

@@ -43,9 +43,9 @@ class Draw:
             Normaliser(0.1 * normal(generator, size), 0.8 + 0.1 * normal(generator, size).square())
             for size in (encoder.input_size, encoder.target_size)
         )
-        model = make_model(num_layers, encoder.input_size, encoder.target_size, num_inducing, generator)
+        model = make_model(num_layers, encoder.input_size, encoder.target_size, num_inducing, generator, kernel)
         whitened = model.split(normal(generator, PARTICLES, model.num_whitened()))
-        posterior = Posterior(kernel, model, factorise_all(kernel, model), whitened)
+        posterior = Posterior(factorise_all(model), whitened)
 
         def sampler(dtype):
             coordinates = Coordinates(encoder, inputs, targets, dtype)
@@ -195,7 +195,14 @@ def test_the_model_draws_compiled_worlds_and_plans_alike_without(refresh):
     results = []
     for compile in (True, False):
         model = DeepGPDynamics(
-            3, 2, num_inducing=20, num_features=32, first_iterations=20, num_samples=5, refresh=refresh, compile=compile
+            3,
+            2,
+            num_inducing=20,
+            num_features=32,
+            first_training_iterations=20,
+            num_samples=5,
+            refresh=refresh,
+            compile=compile,
         )
         model.fit(data, seeded(1))
         world = model.draw(PARTICLES, HORIZON, seeded(2))
@@ -205,7 +212,7 @@ def test_the_model_draws_compiled_worlds_and_plans_alike_without(refresh):
 
 
 def test_double_precision_is_rolled_out_by_pytorch():
-    model = DeepGPDynamics(3, 2, num_inducing=5, first_iterations=2, num_samples=2, dtype=torch.float64)
+    model = DeepGPDynamics(3, 2, num_inducing=5, first_training_iterations=2, num_samples=2, dtype=torch.float64)
     observation = normal(seeded(), 10, 3).float()
     model.fit(Transitions(observation, observation[:, :2], observation), seeded())
     assert not isinstance(model.draw(2, 3, seeded()), TrajectorySampler)
