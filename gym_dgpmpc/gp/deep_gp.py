@@ -78,6 +78,10 @@ class Factorised(NamedTuple):
     model: DeepGP
     factors: list[Float[Tensor, "M M"]]
 
+    def detach(self) -> "Factorised":
+        """The same with hyperparameters that are constants."""
+        return Factorised(self.model.detach(), self.factors)
+
 
 def factorise_all(model: DeepGP) -> Factorised:
     """The model with L_z of every layer.

@@ -26,7 +26,7 @@ from gym_dgpmpc.inference.sghmc import SGHMCState
 
 @dataclass(frozen=True)
 class InferenceSettings:
-    """Settings of the sampler and the hyperparameter optimiser.
+    """Settings of the sampler and the hyperparameter optimiser; `DeepGPDynamics` takes them as keyword arguments.
 
     Attributes:
         step_size: epsilon of SG-HMC; twice the value of Havasi et al., see docs/deviations.md.
@@ -154,7 +154,7 @@ class MCEM:
             live = factorise_all(self._live)
 
         # E-step: move the inducing outputs under the current hyperparameters.
-        fixed = live._replace(model=self._live.detach())
+        fixed = live.detach()
         self.value, gradient = _gradient(fixed, self.chain, batch, num_data, generator)
         self.chain = sghmc.step(
             self.chain, gradient, num_data, generator, step_size=settings.step_size, decay=settings.decay, burn_in=True
@@ -222,7 +222,7 @@ def sample(
 ) -> Iterator[SGHMCState]:
     """Run the chain with frozen hyperparameters and preconditioner; yield it every ``spacing`` steps."""
     num_data = data.num_rows
-    fixed = factorised._replace(model=factorised.model.detach())
+    fixed = factorised.detach()
     for _ in range(num_samples):
         for _ in range(spacing):
             batch = minibatch(data, settings.batch_size, generator)

@@ -49,9 +49,7 @@ def test_the_command_of_a_run_makes_that_run(name):
 def test_the_table_is_12_settings_on_3_tasks_with_10_seeds():
     runs = jobs("table")
     cells = Counter((run.task.name, run.settings["num_layers"], run.settings["kernel"]) for run in runs)
-    assert set(cells) == {
-        (task, layers, kernel) for task in PAPER_TASKS for layers in (1, 2, 3) for kernel in paper.KERNELS
-    }
+    assert set(cells) == {(task, layers, kernel) for task in PAPER_TASKS for layers in (1, 2, 3) for kernel in KERNELS}
     assert set(cells.values()) == {10}
     for run in runs:
         assert run.episodes == (10 if "Cheetah" in run.task.name else 15)

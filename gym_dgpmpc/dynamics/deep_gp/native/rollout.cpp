@@ -1,8 +1,8 @@
 // Rollouts through functions that are fixed for a plan, in one pass and in single precision.
 //
-// `dynamics/deep_gp/compiled_rollout.py` packs what `PathwiseSampler` drew into a Task and calls `rollout` for one particle and
-// a range of candidates; several threads may do so at the same time. Every candidate's trajectory is independent of the
-// others, so a call runs through all steps by itself. Per step and layer each point goes through
+// `dynamics/deep_gp/compiled_rollout.py` packs what `PathwiseSampler` drew into a Task and calls `rollout` for one
+// particle and a range of candidates; several threads may do so at the same time. Every candidate's trajectory is
+// independent of the others, so a call runs through all steps by itself. Per step and layer each point goes through
 //
 //     f(x) = sum_m k(argument_m(x)) kernel_out_m + sum_i cos(2 pi turns_i(x)) feature_out_i
 //
@@ -63,7 +63,7 @@ struct Task {
   const float *spread;                                 // [S]
   const int64_t *target;                               // [S]: which output, or -1
   int64_t num_vectors;
-  const int64_t *vectors;       // [num_vectors, 3]: where heading, x and y are; what is added to x and y is along the body
+  const int64_t *vectors;       // [num_vectors, 3]: where heading, x and y are; what is added to x, y is along the body
   const Layer *layers;                                 // [L]
   const float *start;                                  // [S]
   const float *actions;                                // [K, H, A]
@@ -237,7 +237,8 @@ void evaluate(const Task &task, const Layer &layer, const float *kernel_out, con
   }
 }
 
-// What is known of each kernel, in the order of their numbers.
+// The kernels by their numbers. Each layer has its own, so `evaluate` is called through a pointer: once for some ten
+// thousand numbers between the two products, which is nothing.
 struct Entry {
   const char *name;
   decltype(&evaluate<RBF>) evaluate;
