@@ -18,7 +18,6 @@ from torch import Tensor
 
 from benchmarks.rows import Row, measure_missing
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
-from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.types import DynamicsModel, Transitions
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -27,10 +26,10 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "exact draws of the last layer (default)": {},
     "hyperparameters every 2nd step": {"hyperparameters_every": 2},
     "hyperparameters every 4th step": {"hyperparameters_every": 4},
-    "half the iterations": {"first_iterations": 2000},
+    "half the iterations": {"first_training_iterations": 2000},
     "stopped early, patience 5": {"patience": 5},
 }
-"""Ways of training, as arguments of `DeepGPDynamics` or `InferenceSettings`."""
+"""Ways of training, as arguments of `DeepGPDynamics`."""
 
 SETTINGS = argparse.ArgumentParser(add_help=False)
 SETTINGS.add_argument("--layers", type=int, default=2)
@@ -92,11 +91,9 @@ def measure(wanted: Row) -> Row:
     """One model on one random episode."""
     variant, seed = VARIANTS[wanted["variant"]], wanted["seed"]
     env, generator = gymnasium.make(ENVIRONMENT), torch.Generator().manual_seed(seed)
-    inference = {key: value for key, value in variant.items() if key in InferenceSettings.__annotations__}
-    settings = {key: value for key, value in variant.items() if key not in inference}
     model = DeepGPDynamics(
         4, 1, env.get_wrapper_attr("observation_spec"), num_layers=wanted["layers"], kernel=wanted["kernel"],
-        inference=InferenceSettings(**inference), **settings,
+        **variant,
     )  # fmt: skip
     started = time.process_time()
     metrics = model.fit(random_episode(env, seed, 0.0), generator)

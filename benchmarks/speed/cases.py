@@ -104,7 +104,7 @@ def deep_gp(case: Case, num_layers: int, data: Transitions, **settings: Any) -> 
     """A fitted deep GP of the case's sizes; a few iterations, since cost does not depend on what was learned."""
     arguments = {"num_inducing": NUM_INDUCING, "num_samples": 10} | settings
     model = DeepGPDynamics(
-        case.observation_size, case.action_size, case.spec, num_layers=num_layers, first_iterations=30,
+        case.observation_size, case.action_size, case.spec, num_layers=num_layers, first_training_iterations=30,
         sample_spacing=1, **arguments,
     )  # fmt: skip
     model.fit(data, seeded(0))

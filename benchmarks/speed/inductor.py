@@ -15,7 +15,7 @@ from gym_dgpmpc.types import Transitions
 def compiled_step(case: Case, model: DeepGPDynamics, data: Transitions) -> tuple[Callable[[], None], float]:
     """One rollout step of all layers of a Matern-3/2 model, and the seconds that compiling took."""
     world = model.draw(NUM_PARTICLES, case.horizon, seeded(1))
-    assert isinstance(world, PathwiseSampler) and model.kernel == "matern32"
+    assert isinstance(world, PathwiseSampler) and model.kernel.name == "matern32"
     layers = [
         (layer.inverse_lengthscale, *weights, layer.kernel_out[0].mT, layer.feature_out[0].mT)
         for layer, weights in zip(world.layers, world._in_weights, strict=True)

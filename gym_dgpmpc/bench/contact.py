@@ -34,7 +34,6 @@ from gym_dgpmpc.bench.contact_scores import scores
 from gym_dgpmpc.bench.jobs import Folders
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.envs.mod_cartpole import ModCartPoleEnv
-from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.runs.provenance import machine, revision, versions
 from gym_dgpmpc.types import DynamicsModel
 
@@ -144,9 +143,9 @@ def _model(key: ContactKey, settings: ContactSettings) -> DeepGPDynamics:
         num_inducing=settings.num_inducing,
         # The paper's law: candidates of one plan are drawn jointly, but each start of a test stands for itself.
         draw="marginal",
-        first_iterations=settings.first_iterations,
+        first_training_iterations=settings.first_iterations,
         num_samples=settings.num_samples,
         sample_spacing=settings.sample_spacing,
-        inference=InferenceSettings(patience=settings.patience),
+        patience=settings.patience,
         dtype=torch.float64,
     )

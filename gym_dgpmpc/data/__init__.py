@@ -1,1 +1,1 @@
-"""Transitions as they are stored, and what a dynamics model reads of them: encoding and standardisation."""
+"""Transitions as they are stored, and what a dynamics model reads of them: encoding, standardisation, minibatches."""

@@ -97,11 +97,11 @@ class Encoder:
 
     def inputs(self, observation: Float[Tensor, "*b S"], action: Float[Tensor, "*b A"]) -> Float[Tensor, "*b D"]:
         """The model's input, size D = plain dimensions + 2 x angles + A."""
-        parts = [self.vectors.turned(observation, observation, -1.0)[..., self.plain]]
+        columns = [self.vectors.turned(observation, observation, -1.0)[..., self.plain]]
         if self.angles:
             angle = observation[..., self.angles]
-            parts += [angle.sin(), angle.cos()]
-        return torch.cat([*parts, action], dim=-1)
+            columns += [angle.sin(), angle.cos()]
+        return torch.cat([*columns, action], dim=-1)
 
     def targets(
         self, observation: Float[Tensor, "*b S"], next_observation: Float[Tensor, "*b S"]
@@ -142,8 +142,8 @@ def _check_body_frame(observation_size: int, spec: ObservationSpec) -> None:
         if len(frame) != 3 or len(set(frame)) != 3 or not all(0 <= i < observation_size for i in frame):
             raise ValueError(f"{what} distinct indices from 0 to {observation_size - 1}, received {frame}")
     headings = {heading for heading, _, _ in spec.body_frame}
-    parts = [i for _, *vector in spec.body_frame for i in vector]
-    if len(set(parts)) != len(parts) or headings.intersection(parts):
+    components = [i for _, *vector in spec.body_frame for i in vector]
+    if len(set(components)) != len(components) or headings.intersection(components):
         raise ValueError(
             f"{what} vectors that share no index with another or with a heading, received {spec.body_frame}"
         )

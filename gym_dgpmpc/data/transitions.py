@@ -94,15 +94,15 @@ class TransitionStore:
         return Transitions(*(self._view(name) for name in Transitions._fields))
 
     @property
-    def rewards(self) -> Float[Tensor, " N"]:
+    def rewards(self) -> Float[Tensor, "N"]:
         return self._view("reward")
 
     @property
-    def terminated(self) -> Bool[Tensor, " N"]:
+    def terminated(self) -> Bool[Tensor, "N"]:
         return self._view("terminated")
 
     @property
-    def episodes(self) -> Int[Tensor, " N"]:
+    def episodes(self) -> Int[Tensor, "N"]:
         """The index of the episode to which each row belongs."""
         return self._view("episode")
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
-from gym_dgpmpc.inference.mcem import Data
+from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.types import ObservationSpec, Transitions
 
 Fitted = TypeVar("Fitted")

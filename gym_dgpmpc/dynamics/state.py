@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 
 from gym_dgpmpc.data.normaliser import Normaliser
-from gym_dgpmpc.gp.layer import Layer
+from gym_dgpmpc.gp.kernels import Kernel
+from gym_dgpmpc.gp.layer import PARAMETERS, Layer
 from gym_dgpmpc.types import StateDict
 
 
@@ -42,12 +43,14 @@ def take_normaliser(state: StateDict, name: str, size: int, device: torch.device
     return Normaliser(*(take_tensor(state, f"{name}.{key}", (size,), device) for key in Normaliser._fields))
 
 
-def take_layer(state: StateDict, prefix: str, num_inducing: int, input_size: int, device: torch.device) -> Layer:
-    """The layer whose entries begin with ``prefix``.
+def take_layer(
+    state: StateDict, prefix: str, kernel: Kernel, num_inducing: int, input_size: int, device: torch.device
+) -> Layer:
+    """The layer with this kernel whose entries begin with ``prefix``.
 
     Raises:
         ValueError: as `take_tensor`.
     """
     shapes = ((num_inducing, input_size), (input_size,), ())
-    fields = zip(Layer._fields, shapes, strict=True)
-    return Layer(*(take_tensor(state, f"{prefix}{name}", shape, device) for name, shape in fields))
+    fields = zip(PARAMETERS, shapes, strict=True)
+    return Layer(kernel, *(take_tensor(state, f"{prefix}{name}", shape, device) for name, shape in fields))

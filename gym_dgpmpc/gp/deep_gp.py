@@ -6,21 +6,24 @@ inducing outputs and fits the hyperparameters of what is defined here; `dynamics
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.gp.kernels import Kernel
-from gym_dgpmpc.gp.layer import Layer, conditional, factorise
+from gym_dgpmpc.gp.layer import PARAMETERS, Layer, conditional, factorise
 
 NOISE_FLOOR = 1e-6
 """Lower bound of the noise variance, in standardised targets: below it single-precision data says nothing."""
 
 
 class DeepGP(NamedTuple):
-    """The hyperparameters {theta, Z, beta} of a deep Gaussian process with L layers, T targets, inputs of size D."""
+    """A deep Gaussian process with L layers, T targets and inputs of size D, by its hyperparameters {theta, Z, beta}.
+
+    Every layer has a kernel of its own, as a rule the same one.
+    """
 
     layers: tuple[Layer, ...]
     log_noise: Float[Tensor, "T"]
@@ -39,8 +42,8 @@ class DeepGP(NamedTuple):
         shapes = [
             (layer.inducing_inputs.shape[0], size) for layer, size in zip(self.layers, self.output_sizes(), strict=True)
         ]
-        parts = whitened.split([m * o for m, o in shapes], dim=-1)
-        return [part.unflatten(-1, shape) for part, shape in zip(parts, shapes, strict=True)]
+        by_layer = whitened.split([m * o for m, o in shapes], dim=-1)
+        return [flat.unflatten(-1, shape) for flat, shape in zip(by_layer, shapes, strict=True)]
 
     def num_whitened(self) -> int:
         """V, the length of the flat vector of all whitened inducing outputs."""
@@ -54,41 +57,62 @@ class DeepGP(NamedTuple):
 
     def parameters(self) -> list[Tensor]:
         """The tensors that the hyperparameter optimiser moves."""
-        return [tensor for layer in self.layers for tensor in layer] + [self.log_noise]
+        return [tensor for layer in self.layers for tensor in layer.parameters().values()] + [self.log_noise]
+
+    def with_parameters(self, parameters: Sequence[Tensor]) -> "DeepGP":
+        """The same kernels with other tensors, given in the order of `parameters`."""
+        each = iter(parameters)
+        layers = tuple(Layer(layer.kernel, *(next(each) for _ in PARAMETERS)) for layer in self.layers)
+        return DeepGP(layers, next(each))
 
     def detach(self) -> "DeepGP":
-        return DeepGP(tuple(Layer(*(t.detach() for t in layer)) for layer in self.layers), self.log_noise.detach())
+        return self.with_parameters([tensor.detach() for tensor in self.parameters()])
 
 
-def factorise_all(kernel: Kernel, model: DeepGP) -> list[Tensor]:
-    """L_z of every layer."""
-    return [factorise(kernel, layer) for layer in model.layers]
+class Factorised(NamedTuple):
+    """A model and L_z of its layers, computed once for all that is done with these hyperparameters.
+
+    Gradients with respect to the hyperparameters are complete without any through the factors; see `layer.project`.
+    """
+
+    model: DeepGP
+    factors: list[Float[Tensor, "M M"]]
+
+    def detach(self) -> "Factorised":
+        """The same with hyperparameters that are constants."""
+        return Factorised(self.model.detach(), self.factors)
+
+
+def factorise_all(model: DeepGP) -> Factorised:
+    """The model with L_z of every layer.
+
+    Raises:
+        FactorisationError: see `linalg.cholesky`.
+    """
+    return Factorised(model, [factorise(layer) for layer in model.layers])
 
 
 def propagate(
-    kernel: Kernel,
-    model: DeepGP,
-    factors: list[Tensor],
+    factorised: Factorised,
     whitened: list[Tensor],
     x: Float[Tensor, "*p n D"],
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, "*p n T"], Float[Tensor, "*p n"]]:
     """Mean and variance of the last layer, given one sample through each inner layer (its marginals)."""
-    x = propagate_inner(kernel, model, factors, whitened, x, generator)
-    return conditional(kernel, model.layers[-1], factors[-1], whitened[-1], x)
+    x = propagate_inner(factorised, whitened, x, generator)
+    return conditional(factorised.model.layers[-1], factorised.factors[-1], whitened[-1], x)
 
 
 def propagate_inner(
-    kernel: Kernel,
-    model: DeepGP,
-    factors: list[Tensor],
+    factorised: Factorised,
     whitened: list[Tensor],
     x: Float[Tensor, "*p n D"],
     generator: torch.Generator,
 ) -> Float[Tensor, "*p n D"]:
     """What the last layer is fed: one sample through each inner layer (its marginals); ``x`` itself if L = 1."""
+    model, factors = factorised
     for layer, factor, v in zip(model.layers[:-1], factors[:-1], whitened[:-1], strict=True):
-        mean, variance = conditional(kernel, layer, factor, v, x)
+        mean, variance = conditional(layer, factor, v, x)
         noise = torch.randn(mean.shape, generator=generator, dtype=x.dtype, device=x.device)
         # The floor keeps the square root's gradient finite where the variance vanishes.
         x = x + mean + variance.clamp_min(1e-12).sqrt().unsqueeze(-1) * noise

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.gp.kernels import Kernel, correlation, scaled_sqdist
+from gym_dgpmpc.gp.kernels import scaled_sqdist
 from gym_dgpmpc.gp.layer import Layer
 
 
@@ -23,7 +23,6 @@ class Gaussians(NamedTuple):
 
 
 def regression(
-    kernel: Kernel,
     layer: Layer,
     noise_variance: Float[Tensor, "T"],
     x: Float[Tensor, "N D"],
@@ -35,14 +34,13 @@ def regression(
     mean = k_*x (K_xx + noise I)^-1 y, covariance = k_** - k_*x (K_xx + noise I)^-1 k_x*
     (Rasmussen and Williams 2006, eqs. 2.23 and 2.24).
     """
-    prior, cross = _covariance(kernel, layer, x_new, x_new), _covariance(kernel, layer, x, x_new)
-    noisy = _covariance(kernel, layer, x, x) + torch.diag_embed(noise_variance.unsqueeze(-1).expand(-1, len(x)))
+    prior, cross = _covariance(layer, x_new, x_new), _covariance(layer, x, x_new)
+    noisy = _covariance(layer, x, x) + torch.diag_embed(noise_variance.unsqueeze(-1).expand(-1, len(x)))
     gain = torch.linalg.solve(noisy, cross.expand(len(noise_variance), -1, -1)).mT
     return Gaussians((gain @ y.mT.unsqueeze(-1)).squeeze(-1).mT, prior - gain @ cross)
 
 
 def whitened_posterior(
-    kernel: Kernel,
     layer: Layer,
     factor: Float[Tensor, "M M"],
     noise_variance: Float[Tensor, "T"],
@@ -57,12 +55,12 @@ def whitened_posterior(
 
         covariance = (I + sum_n a_n a_n^T / s_n)^-1,  mean = covariance sum_n a_n y_n / s_n.
     """
-    a = torch.linalg.solve_triangular(factor, _covariance(kernel, layer, layer.inducing_inputs, x), upper=False)
+    a = torch.linalg.solve_triangular(factor, _covariance(layer, layer.inducing_inputs, x), upper=False)
     s = layer.variance - a.square().sum(0) + noise_variance.unsqueeze(-1)  # "T N"
     weighted = a / s.unsqueeze(1)  # "T M N"
     covariance = torch.linalg.inv(torch.eye(len(a), dtype=a.dtype, device=a.device) + weighted @ a.mT)
     return Gaussians((covariance @ weighted @ y.mT.unsqueeze(-1)).squeeze(-1).mT, covariance)
 
 
-def _covariance(kernel: Kernel, layer: Layer, x: Tensor, z: Tensor) -> Tensor:
-    return layer.variance * correlation(kernel, scaled_sqdist(x, z, layer.lengthscale))
+def _covariance(layer: Layer, x: Tensor, z: Tensor) -> Tensor:
+    return layer.variance * layer.kernel.correlation(scaled_sqdist(x, z, layer.lengthscale))

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.gp.kernels import Kernel, smoothness
+from gym_dgpmpc.gp.kernels import Kernel
 
 
 class Features(NamedTuple):
@@ -29,18 +29,7 @@ class Features(NamedTuple):
 def draw_features(
     kernel: Kernel, num_features: int, input_size: int, generator: torch.Generator, dtype: torch.dtype = torch.float64
 ) -> Features:
-    """Frequencies from the kernel's spectral density, phases uniform over a turn.
-
-    RBF: standard normal. Matern-nu: multivariate Student-t with 2 nu degrees of freedom, that is a standard normal
-    over sqrt(g) with g ~ Gamma(nu, rate nu) shared by the dimensions of one frequency.
-    """
-    device = generator.device
-    frequency = torch.randn(num_features, input_size, generator=generator, dtype=dtype, device=device)
-    order = smoothness(kernel)
-    if order != float("inf"):
-        # 2 nu is a whole number for the kernels here, so the Gamma variate is a mean of squared normals.
-        degrees = round(2 * order)
-        normals = torch.randn(num_features, degrees, generator=generator, dtype=dtype, device=device)
-        frequency = frequency / normals.square().mean(-1, keepdim=True).sqrt()
-    phase = 2 * torch.pi * torch.rand(num_features, generator=generator, dtype=dtype, device=device)
+    """Frequencies from the kernel's spectral density, phases uniform over a turn."""
+    frequency = kernel.draw_frequencies(num_features, input_size, generator, dtype)
+    phase = 2 * torch.pi * torch.rand(num_features, generator=generator, dtype=dtype, device=generator.device)
     return Features(frequency, phase)

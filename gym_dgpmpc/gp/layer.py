@@ -10,14 +10,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.gp.kernels import Kernel, correlation, pairwise_sqdist, scaled_sqdist
+from gym_dgpmpc.gp.kernels import Kernel, pairwise_sqdist, scaled_sqdist
 from gym_dgpmpc.gp.linalg import cholesky
 from gym_dgpmpc.gp.projection import projection
 
 
 class Layer(NamedTuple):
-    """Hyperparameters theta and inducing inputs Z of one layer."""
+    """Kernel, its hyperparameters theta, and inducing inputs Z of one layer."""
 
+    kernel: Kernel
     inducing_inputs: Float[Tensor, "M D"]
     log_lengthscale: Float[Tensor, "D"]
     log_variance: Float[Tensor, ""]
@@ -30,20 +31,27 @@ class Layer(NamedTuple):
     def variance(self) -> Tensor:
         return self.log_variance.exp()
 
+    def parameters(self) -> dict[str, Tensor]:
+        """Every tensor by name."""
+        return {name: getattr(self, name) for name in PARAMETERS}
 
-def factorise(kernel: Kernel, layer: Layer) -> Float[Tensor, "M M"]:
+
+PARAMETERS = ("inducing_inputs", "log_lengthscale", "log_variance")
+"""The tensors of a `Layer`, which training moves and states hold; the kernel is a setting."""
+
+
+def factorise(layer: Layer) -> Float[Tensor, "M M"]:
     """L_z, the lower Cholesky factor of K_zz + jitter.
 
     Raises:
         FactorisationError: see `linalg.cholesky`.
     """
     z = layer.inducing_inputs
-    unit = correlation(kernel, scaled_sqdist(z, z, layer.lengthscale))
+    unit = layer.kernel.correlation(scaled_sqdist(z, z, layer.lengthscale))
     return layer.variance.sqrt() * cholesky(unit, torch.ones_like(layer.log_variance))
 
 
 def conditional(
-    kernel: Kernel,
     layer: Layer,
     factor: Float[Tensor, "M M"],
     whitened: Float[Tensor, "*p M O"],
@@ -53,29 +61,26 @@ def conditional(
 
     mean = k_xz L_z^-T v, variance = k_xx - |L_z^-1 k_zx|^2, the same for every output.
     """
-    projected = project(kernel, layer, factor, x)
+    projected = project(layer, factor, x)
     # The kernel's variance enters here and not in the large matrix, which training differentiates through.
     variance = layer.variance * (1.0 - projected.square().sum(-2))
     return layer.variance.sqrt() * (projected.mT @ whitened), variance.clamp_min(0.0)
 
 
 def joint_conditional(
-    kernel: Kernel,
     layer: Layer,
     factor: Float[Tensor, "M M"],
     whitened: Float[Tensor, "*p M O"],
     x: Float[Tensor, "*p n D"],
 ) -> tuple[Float[Tensor, "*p n O"], Float[Tensor, "*p n n"]]:
     """As `conditional`, with the full covariance of the n points: k_xx' - k_xz K_zz^-1 k_zx'."""
-    projected = project(kernel, layer, factor, x)
-    prior = correlation(kernel, pairwise_sqdist(x / layer.lengthscale))
+    projected = project(layer, factor, x)
+    prior = layer.kernel.correlation(pairwise_sqdist(x / layer.lengthscale))
     covariance = layer.variance * (prior - projected.mT @ projected)
     return layer.variance.sqrt() * (projected.mT @ whitened), covariance
 
 
-def project(
-    kernel: Kernel, layer: Layer, factor: Float[Tensor, "M M"], x: Float[Tensor, "*p n D"]
-) -> Float[Tensor, "*p M n"]:
+def project(layer: Layer, factor: Float[Tensor, "M M"], x: Float[Tensor, "*p n D"]) -> Float[Tensor, "*p M n"]:
     """L_z^-1 k_zx / sigma, of which every column has a length of at most one.
 
     Args:
@@ -84,4 +89,4 @@ def project(
     """
     lengthscale = layer.lengthscale
     unit = (factor / layer.variance.sqrt()).detach()
-    return projection(kernel, x / lengthscale, layer.inducing_inputs / lengthscale, unit)
+    return projection(layer.kernel, x / lengthscale, layer.inducing_inputs / lengthscale, unit)

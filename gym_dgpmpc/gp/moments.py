@@ -50,8 +50,8 @@ def predicted_moments(predictor: Predictor, mean: Float[Tensor, "K D"], covarian
         covariance: positive semi-definite; inputs that are known have variance zero.
     """
     count = max(1, _ELEMENTS_AT_ONCE // len(predictor.centres) ** 2)
-    parts = [_moments(predictor, *part) for part in zip(mean.split(count), covariance.split(count), strict=True)]
-    return Moments(*(torch.cat(values) for values in zip(*parts, strict=True)))
+    moments = [_moments(predictor, *inputs) for inputs in zip(mean.split(count), covariance.split(count), strict=True)]
+    return Moments(*(torch.cat(values) for values in zip(*moments, strict=True)))
 
 
 def _moments(predictor: Predictor, mean: Tensor, covariance: Tensor) -> Moments:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.gp.kernels import Kernel, correlation_and_slope, sqdist
+from gym_dgpmpc.gp.kernels import Kernel, sqdist
 
 
 class _Projection(torch.autograd.Function):
@@ -24,7 +24,7 @@ class _Projection(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, z: Tensor, factor: Tensor, kernel: Kernel) -> Tensor:
-        value, slope = correlation_and_slope(kernel, sqdist(x, z))
+        value, slope = kernel.correlation_and_slope(sqdist(x, z))
         projected = torch.linalg.solve_triangular(factor, value.mT, upper=False)
         ctx.save_for_backward(x, z, factor, slope, projected)
         ctx.kernel = kernel
@@ -34,22 +34,26 @@ class _Projection(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
         (gradient,) = grad_outputs
         x, z, factor, slope, projected = ctx.saved_tensors
+        # The gradient of every squared distance |x_i - z_j|^2: r_bar = L^-T A_bar, times the kernel's slope.
         by_distance = torch.linalg.solve_triangular(factor.mT, gradient, upper=True).mT * slope  # "*p n M"
         x_bar = z_bar = None
         if ctx.needs_input_grad[0]:
+            # d |x_i - z_j|^2 / d x_i = 2 (x_i - z_j), summed over the j.
             x_bar = 2.0 * (by_distance.sum(-1, keepdim=True) * x - by_distance @ z)
         if ctx.needs_input_grad[1]:
+            # First z_j in its distances to the points: d |x_i - z_j|^2 / d z_j = 2 (z_j - x_i), summed over the i.
             points = by_distance.sum(-2).unsqueeze(-1) * z - by_distance.mT @ x
-            outer = gradient @ projected.mT
+            outer = gradient @ projected.mT  # A_bar A^T, through which the factor's gradient comes
             leading = tuple(range(gradient.ndim - 2))
-            if leading:
+            if leading:  # one factor serves all particles, so their gradients add up
                 points, outer = points.sum(leading), outer.sum(leading)
+            # Then in K_zz: Phi, L^-T from the left and L^-1 from the right, and the symmetric part of it.
             lower = outer.tril()
             lower.diagonal().mul_(0.5)
             inner = torch.linalg.solve_triangular(factor.mT, lower, upper=True)
             covariance_bar = -torch.linalg.solve_triangular(factor, inner, upper=False, left=False)
             symmetric = 0.5 * (covariance_bar + covariance_bar.mT)
-            by_own_distance = symmetric * correlation_and_slope(ctx.kernel, sqdist(z, z))[1]
+            by_own_distance = symmetric * ctx.kernel.correlation_and_slope(sqdist(z, z))[1]
             # Each inducing input is on both sides of its own distances, hence twice.
             own = by_own_distance.sum(-1, keepdim=True) * z - by_own_distance @ z
             z_bar = 2.0 * points + 4.0 * own

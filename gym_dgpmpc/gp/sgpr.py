@@ -12,13 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.gp.kernels import Kernel, argument_scale, correlation_, scaled_sqdist
+from gym_dgpmpc.gp.kernels import scaled_sqdist
 from gym_dgpmpc.gp.layer import Layer, factorise, project
 from gym_dgpmpc.gp.linalg import cholesky
 
 
 def collapsed_bound(
-    kernel: Kernel,
     layer: Layer,
     noise_variance: Float[Tensor, "T"],
     x: Float[Tensor, "N D"],
@@ -34,8 +33,8 @@ def collapsed_bound(
     Only A A^T, A y and |y|^2 depend on the data, so further outputs cost next to nothing.
     """
     with torch.no_grad():
-        factor = factorise(kernel, layer)  # its derivative is part of the projection's
-    a = layer.variance.sqrt() * project(kernel, layer, factor, x)
+        factor = factorise(layer)  # its derivative is part of the projection's
+    a = layer.variance.sqrt() * project(layer, factor, x)
     gram, projected, num_data = a @ a.mT, (a @ y).mT.unsqueeze(-1), len(x)
     noise = noise_variance.view(-1, 1, 1)
     eye = torch.eye(len(a), dtype=a.dtype, device=a.device)
@@ -60,15 +59,14 @@ class SparsePosterior(NamedTuple):
 
 
 def sparse_posterior(
-    kernel: Kernel,
     layer: Layer,
     noise_variance: Float[Tensor, "T"],
     x: Float[Tensor, "N D"],
     y: Float[Tensor, "N T"],
 ) -> SparsePosterior:
     """m_t = (A A^T + s_t I)^-1 A y_t and the basis in which its covariance is diagonal."""
-    factor = factorise(kernel, layer)
-    a = layer.variance.sqrt() * project(kernel, layer, factor, x)
+    factor = factorise(layer)
+    a = layer.variance.sqrt() * project(layer, factor, x)
     spectrum, vectors = torch.linalg.eigh(a @ a.mT)
     spectrum = spectrum.clamp_min(0.0)
     mean = (vectors.mT @ (a @ y)) / (spectrum.unsqueeze(-1) + noise_variance)
@@ -84,7 +82,6 @@ def shrinkage(posterior: SparsePosterior, noise_variance: Float[Tensor, "T"]) ->
 
 @torch.no_grad()
 def sparse_predict(
-    kernel: Kernel,
     layer: Layer,
     noise_variance: Float[Tensor, "T"],
     posterior: SparsePosterior,
@@ -97,8 +94,8 @@ def sparse_predict(
     No gradient. Single precision will not do: trained on 1,000 transitions of the cart-pole, which gave sigma^2 = 104,
     it moves means by up to one standard deviation of the noise.
     """
-    sqdist = scaled_sqdist(x, layer.inducing_inputs, layer.lengthscale)
-    b = correlation_(kernel, sqdist.mul_(argument_scale(kernel))) @ posterior.basis.mT
+    kernel, sqdist = layer.kernel, scaled_sqdist(x, layer.inducing_inputs, layer.lengthscale)
+    b = kernel.correlation_(sqdist.mul_(kernel.argument_scale)) @ posterior.basis.mT
     mean = b @ posterior.mean
     variance = layer.variance - b.square_() @ shrinkage(posterior, noise_variance)
     return mean, variance.clamp_min_(0.0)

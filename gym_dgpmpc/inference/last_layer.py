@@ -12,8 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.gp.deep_gp import DeepGP, propagate_inner
-from gym_dgpmpc.gp.kernels import Kernel
+from gym_dgpmpc.gp.deep_gp import Factorised, propagate_inner
 from gym_dgpmpc.gp.layer import project
 from gym_dgpmpc.gp.linalg import cholesky
 
@@ -35,9 +34,7 @@ class LastLayerPosterior(NamedTuple):
 
 
 def last_layer_posterior(
-    kernel: Kernel,
-    model: DeepGP,
-    factors: list[Float[Tensor, "M M"]],
+    factorised: Factorised,
     whitened: Float[Tensor, "V"],
     x: Float[Tensor, "n D"],
     y: Float[Tensor, "n T"],
@@ -56,9 +53,10 @@ def last_layer_posterior(
     Raises:
         FactorisationError: the precision is not finite, or so large that rounding hides the prior.
     """
+    model, factors = factorised
     last = model.layers[-1]
-    hidden = propagate_inner(kernel, model, factors, model.split(whitened), x, generator)
-    a = last.variance.sqrt() * project(kernel, last, factors[-1], hidden)
+    hidden = propagate_inner(factorised, model.split(whitened), x, generator)
+    a = last.variance.sqrt() * project(last, factors[-1], hidden)
     variance = (last.variance - a.square().sum(0)).clamp_min(0.0)
     weights = weight / (variance + model.noise_variance.unsqueeze(-1))
     weighted = a * weights.unsqueeze(1)

@@ -10,11 +10,10 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
+from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.gp.deep_gp import DeepGP
-from gym_dgpmpc.gp.kernels import Kernel
 from gym_dgpmpc.gp.layer import Layer
 from gym_dgpmpc.gp.sgpr import collapsed_bound
-from gym_dgpmpc.inference.mcem import Data
 
 LENGTHSCALES, VARIANCES, NOISE_VARIANCES = (0.01, 1e3), (1e-4, 1e4), (1e-6, 10.0)
 """Where hyperparameters are kept, for standardised data: beyond, a factorisation would fail before anything is won."""
@@ -28,9 +27,7 @@ class Maximum(NamedTuple):
     num_evaluations: int
 
 
-def maximise_bound(
-    kernel: Kernel, model: DeepGP, data: Data, max_iterations: int, *, free_inducing_inputs: bool = True
-) -> Maximum:
+def maximise_bound(model: DeepGP, data: Data, max_iterations: int, *, free_inducing_inputs: bool = True) -> Maximum:
     """Climb the collapsed bound from ``model``, which has one layer.
 
     Args:
@@ -43,24 +40,24 @@ def maximise_bound(
     limits = [LENGTHSCALES, VARIANCES, NOISE_VARIANCES]
     boxes = [
         (math.log(low), math.log(high))
-        for part, (low, high) in zip(start, limits, strict=True)
-        for _ in range(len(part))
+        for values, (low, high) in zip(start, limits, strict=True)
+        for _ in range(len(values))
     ]
     if free_inducing_inputs:
         start.append(layer.inducing_inputs.flatten())
         boxes += [(-math.inf, math.inf)] * layer.inducing_inputs.numel()
-    sizes = [len(part) for part in start]
+    sizes = [len(values) for values in start]
 
     def unpack(flat: torch.Tensor) -> DeepGP:
         log_lengthscale, log_variance, log_noise, *rest = flat.split(sizes)
         inducing = rest[0].view_as(layer.inducing_inputs) if rest else layer.inducing_inputs
-        return DeepGP((Layer(inducing, log_lengthscale, log_variance.squeeze(0)),), log_noise)
+        return DeepGP((Layer(layer.kernel, inducing, log_lengthscale, log_variance.squeeze(0)),), log_noise)
 
     def negative_bound(flat: np.ndarray) -> tuple[float, np.ndarray]:
         with torch.enable_grad():
             position = torch.tensor(flat, dtype=data.x.dtype, device=data.x.device, requires_grad=True)
             candidate = unpack(position)
-            value = -collapsed_bound(kernel, candidate.layers[0], candidate.noise_variance, *data) / data.y.numel()
+            value = -collapsed_bound(candidate.layers[0], candidate.noise_variance, *data) / data.y.numel()
             (gradient,) = torch.autograd.grad(value, position)
         return value.item(), gradient.cpu().numpy()
 

@@ -1,7 +1,7 @@
 """How long to train, and what to do when training goes wrong: the loop around `mcem.MCEM.step`.
 
 Every so many iterations it looks at the run. If the run has diverged, it goes back to the last look with half the step
-size. If the likelihood of held-out data no longer improves, it stops. `dynamics/deep_gp/` calls it once per fit.
+size. If the likelihood of held-out data no longer improves, it stops. `dynamics/deep_gp/` calls it once a fit.
 """
 
 import math
@@ -13,11 +13,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.errors import FactorisationError, TrainingError
-from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all, log_likelihood, propagate
-from gym_dgpmpc.gp.kernels import Kernel
+from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all, log_likelihood, propagate
 from gym_dgpmpc.inference import mcem
-from gym_dgpmpc.inference.mcem import MCEM, Data, InferenceSettings
+from gym_dgpmpc.inference.mcem import MCEM, InferenceSettings
 from gym_dgpmpc.inference.sghmc import SGHMCState
 
 MAX_ROLLBACKS = 5
@@ -63,7 +63,6 @@ class Sampled(NamedTuple):
 
 
 def train(
-    kernel: Kernel,
     model: DeepGP,
     chain: SGHMCState,
     data: Data,
@@ -84,8 +83,8 @@ def train(
     held_out = None
     if settings.patience is not None:
         data, held_out = _split(data, generator)
-    run = MCEM(kernel, model, chain, data, settings)
-    good, best, rollbacks = run.snapshot(), run.evaluate(_twin(generator)), 0
+    run = MCEM(model, chain, data, settings)
+    good, best, rollbacks = run.snapshot(), run.evaluate(_copied(generator)), 0
     best_likelihood, looks_since = -math.inf, 0
     while run.iteration < num_iterations:
         trouble = _advance(run, min(settings.look_every, num_iterations - run.iteration), generator, best)
@@ -101,7 +100,8 @@ def train(
             continue
         good, best = run.snapshot(), min(best, float(run.value))
         if held_out is not None:
-            likelihood = predictive_log_likelihood(kernel, run.model, _some(run.window, generator), held_out, generator)
+            positions = _drawn_rows(run.window, generator)
+            likelihood = predictive_log_likelihood(factorise_all(run.model), positions, held_out, generator)
             improved = likelihood > best_likelihood
             best_likelihood = max(best_likelihood, likelihood)
             looks_since = 0 if improved else looks_since + 1
@@ -111,8 +111,7 @@ def train(
 
 
 def sample_pool(
-    kernel: Kernel,
-    model: DeepGP,
+    factorised: Factorised,
     chain: SGHMCState,
     data: Data,
     num_samples: int,
@@ -127,12 +126,11 @@ def sample_pool(
     Raises:
         TrainingError: it did so again and again, however small its steps.
     """
-    factors = factorise_all(kernel, model)
     for _ in range(MAX_ROLLBACKS + 1):
         # Of the states in between only the positions are kept: a state is several times as large.
         positions, last = [], chain
         with suppress(FactorisationError):  # of an exact draw: the steps before it led to what is not finite
-            for last in mcem.sample(kernel, model, chain, data, num_samples, spacing, generator, settings, factors):
+            for last in mcem.sample(factorised, chain, data, num_samples, spacing, generator, settings):
                 positions.append(last.position)
         if len(positions) == num_samples and is_plausible(pool := torch.stack(positions)):
             return Sampled(pool, last, settings.step_size)
@@ -149,13 +147,12 @@ def is_plausible(positions: Float[Tensor, "*n V"]) -> bool:
 
 
 def predictive_log_likelihood(
-    kernel: Kernel, model: DeepGP, positions: Float[Tensor, "n V"], data: Data, generator: torch.Generator
+    factorised: Factorised, positions: Float[Tensor, "n V"], data: Data, generator: torch.Generator
 ) -> float:
     """Mean log density of the data under the mixture over posterior samples."""
-    x = data.x.expand(len(positions), -1, -1)
+    model, x = factorised.model, data.x.expand(len(positions), -1, -1)
     with torch.no_grad():
-        factors = factorise_all(kernel, model)
-        mean, variance = propagate(kernel, model, factors, model.split(positions), x, generator)
+        mean, variance = propagate(factorised, model.split(positions), x, generator)
         density = log_likelihood(model, mean, variance, data.y).logsumexp(0) - math.log(len(positions))
     return float(density.mean())
 
@@ -178,19 +175,20 @@ def _advance(run: MCEM, num_iterations: int, generator: torch.Generator, best: f
 
 def _split(data: Data, generator: torch.Generator) -> tuple[Data, Data | None]:
     """Training data and held-out data; None where there are too few to hold any out."""
-    part, most = HELD_OUT
-    count = min(int(part * data.num_rows), most)
+    share, most = HELD_OUT
+    count = min(int(share * data.num_rows), most)
     if count < MIN_HELD_OUT:
         return data, None
     order = torch.randperm(data.num_rows, generator=generator, device=data.x.device)
     return data.rows(order[count:]), data.rows(order[:count])
 
 
-def _twin(generator: torch.Generator) -> torch.Generator:
+def _copied(generator: torch.Generator) -> torch.Generator:
     """A generator that gives the same numbers and leaves the given one where it is."""
     return torch.Generator(generator.device).set_state(generator.get_state())
 
 
-def _some(window: Tensor, generator: torch.Generator) -> Tensor:
+def _drawn_rows(window: Float[Tensor, "W V"], generator: torch.Generator) -> Float[Tensor, "n V"]:
+    """`HELD_OUT_SAMPLES` positions, drawn with replacement."""
     rows = torch.randint(len(window), (HELD_OUT_SAMPLES,), generator=generator, device=window.device)
     return window[rows]

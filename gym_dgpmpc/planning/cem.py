@@ -6,7 +6,9 @@ truncation and the variance cap are in their published code rather than in the t
 
 import math
 import time
-from typing import NamedTuple
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -83,6 +85,9 @@ class CEM:
     Raises:
         TypeError, ValueError: naming the argument, what was expected and what was received.
     """
+
+    largest: ClassVar[Mapping[str, int]] = MappingProxyType({"num_candidates": 10**5})
+    """What a file may claim; see `settings.settings_of`."""
 
     def __init__(
         self,

@@ -87,7 +87,7 @@ def test_the_cart_pole_by_its_id(agent_class, tmp_path):
         (GPMPCAgent, {"draw": "AMM", "num_particles": 3}, "more particles than the 3 numbers .* num_particles = 3"),
         (GPMPCAgent, {"draw": "AMM", "kernel": "matern12"}, "kernel 'rbf' only, received 'matern12'"),
         (GPMPCAgent, {"num_inducing": 0}, "num_inducing must be at least 1, got 0"),
-        (GPMPCAgent, {"max_training_iterations": 0}, "max_iterations must be at least 1, got 0"),
+        (GPMPCAgent, {"max_training_iterations": 0}, "max_training_iterations must be at least 1, got 0"),
         (GPMPCAgent, {"horizon": 0}, "horizon.* 0"),
     ],
 )

@@ -71,10 +71,11 @@ def test_a_run_trains_the_model_of_its_key_and_settings(monkeypatch, key, patien
     with pytest.raises(Trained) as seen:
         ContactRun(key, settings).measure()
     (model,) = seen.value.args
-    assert (model.kernel, model.num_layers) == (key.kernel, key.num_layers)
+    assert (model.kernel.name, model.num_layers) == (key.kernel, key.num_layers)
     assert model.draw_kind == "marginal"  # the paper's law
     assert (model.inference.patience, model.dtype) == (patience, torch.float64)
-    for name in ("num_inducing", "first_iterations", "num_samples", "sample_spacing"):
+    assert model.first_training_iterations == settings.first_iterations
+    for name in ("num_inducing", "num_samples", "sample_spacing"):
         assert getattr(model, name) == getattr(settings, name)
 
 

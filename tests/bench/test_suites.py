@@ -10,9 +10,9 @@ import pytest
 from gym_dgpmpc.agents.presets import COMPARISON_PETS, PAPER, PETS
 from gym_dgpmpc.bench.methods import METHODS
 from gym_dgpmpc.bench.paper import EPISODES as PAPER_TASKS
+from gym_dgpmpc.bench.paper import KERNELS
 from gym_dgpmpc.bench.suites import SUITES, Narrowed, SuiteError, find_suite
 from gym_dgpmpc.bench.tasks import TASKS
-from gym_dgpmpc.gp.kernels import KERNELS
 
 ALL = Narrowed()
 RUN_SUITES = ("table", "comparison", "variance", "unmodified", "long-cheetah", "stock")

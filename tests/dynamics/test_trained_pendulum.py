@@ -5,7 +5,6 @@ import torch
 
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.gp.kernels import KERNELS
-from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.planning.rollout import rollout
 from tests.oracles import pendulum
 from tests.oracles.models import normal, seeded
@@ -13,8 +12,8 @@ from tests.oracles.models import normal, seeded
 DATA = pendulum.simulate(200)
 HORIZON, CANDIDATES, PARTICLES = 30, 20, 5
 SETTINGS = {
-    "num_layers": 2, "num_inducing": 100, "num_features": 128, "first_iterations": 300, "num_samples": 5,
-    "sample_spacing": 2, "inference": InferenceSettings(step_size=0.03, learning_rate=0.03),
+    "num_layers": 2, "num_inducing": 100, "num_features": 128, "first_training_iterations": 300, "num_samples": 5,
+    "sample_spacing": 2, "step_size": 0.03, "learning_rate": 0.03,
 }  # fmt: skip
 
 
@@ -27,7 +26,7 @@ def trained(request):
 
 def twin(trained, dtype, **settings):
     """The same posterior, rolled out in another precision or by another draw."""
-    model = DeepGPDynamics(2, 1, pendulum.SPEC, kernel=trained.kernel, dtype=dtype, **(SETTINGS | settings))
+    model = DeepGPDynamics(2, 1, pendulum.SPEC, kernel=trained.kernel.name, dtype=dtype, **(SETTINGS | settings))
     model.load_state_dict(trained.state_dict())
     return model
 
@@ -78,7 +77,7 @@ def test_rollouts_in_single_precision_are_those_in_double(trained, draw):
         return ((other - double).abs() / scale).flatten().quantile(0.9)
 
     bound = 1e-3
-    if trained.kernel == "matern12" and draw["draw"] == "pathwise":
+    if trained.kernel.name == "matern12" and draw["draw"] == "pathwise":
         exact, generator = sampler(torch.float64), seeded(3)
 
         def perturbed(state, action, step):

@@ -24,7 +24,7 @@ def test_the_flat_vector_is_split_by_layer_and_output(num_layers):
 
 
 def test_parameters_are_the_models_own_and_detaching_keeps_their_values():
-    model = make_model(2, 3, 2, 5, seeded())
+    model = make_model(2, 3, 2, 5, seeded(), "matern32")
     parameters = model.parameters()
     assert len(parameters) == 2 * 3 + 1
     assert parameters[-1] is model.log_noise and parameters[3] is model.layers[1].inducing_inputs
@@ -33,14 +33,25 @@ def test_parameters_are_the_models_own_and_detaching_keeps_their_values():
     detached = model.detach().parameters()
     assert not any(parameter.requires_grad for parameter in detached)
     assert all(torch.equal(a, b) for a, b in zip(parameters, detached, strict=True))
+    assert [layer.kernel for layer in model.detach().layers] == [KERNELS["matern32"]] * 2
+
+
+def test_other_parameters_come_in_the_same_order():
+    """Each layer keeps its kernel, also where they differ."""
+    first, second = (make_model(1, 3, 3, 5, seeded(), kernel).layers[0] for kernel in ("rbf", "matern12"))
+    model = make_model(2, 3, 3, 5, seeded())._replace(layers=(first, second))
+    others = [parameter + 1.0 for parameter in model.parameters()]
+    moved = model.with_parameters(others)
+    assert all(a is b for a, b in zip(moved.parameters(), others, strict=True))
+    assert [layer.kernel.name for layer in moved.layers] == ["rbf", "matern12"]
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_a_single_layer_is_its_conditional(kernel):
     generator = seeded(1)
-    model = make_model(1, 3, 2, 6, generator)
+    model = make_model(1, 3, 2, 6, generator, kernel)
     v, x = normal(generator, 6, 2), normal(generator, 4, 3)
-    mean, variance = propagate(kernel, model, factorise_all(kernel, model), [v], x, generator)
+    mean, variance = propagate(factorise_all(model), [v], x, generator)
     exact_mean, exact_covariance = gaussian_process.conditional(kernel, dense(model.layers[0]), v.numpy(), x.numpy())
     np.testing.assert_allclose(mean, exact_mean, atol=1e-8)
     np.testing.assert_allclose(variance, np.diagonal(exact_covariance), atol=1e-8)
@@ -50,7 +61,7 @@ def test_a_single_layer_is_its_conditional(kernel):
 def test_two_layers_against_quadrature_over_the_hidden_value(kernel):
     """x -> h ~ N(x + m_1(x), v_1(x) I) -> m_2(h), v_2(h): the moments of m_2 and the mean of v_2, in two dimensions."""
     generator = seeded(4)
-    model = make_model(2, 2, 2, 6, generator)
+    model = make_model(2, 2, 2, 6, generator, kernel)
     whitened = [normal(generator, 6, 2), normal(generator, 6, 2)]
     x = normal(generator, 3, 2)
     inner, outer = (dense(layer) for layer in model.layers)
@@ -65,9 +76,7 @@ def test_two_layers_against_quadrature_over_the_hidden_value(kernel):
 
     draws = 20_000
     expanded = [v.expand(draws, -1, -1) for v in whitened]
-    mean, variance = propagate(
-        kernel, model, factorise_all(kernel, model), expanded, x.expand(draws, -1, -1), generator
-    )
+    mean, variance = propagate(factorise_all(model), expanded, x.expand(draws, -1, -1), generator)
     for point in range(3):
         # One node at a time: the marginals of each hidden value are all that propagation uses.
         m, v = gaussian_process.conditional(kernel, outer, whitened[1].numpy(), hidden[point][:, None])
@@ -89,7 +98,7 @@ def test_points_and_particles_have_noise_of_their_own():
     model = make_model(2, 2, 1, 6, generator)
     whitened = [v.expand(5000, -1, -1) for v in model.split(normal(generator, model.num_whitened()))]
     x = normal(generator, 1, 2).expand(5000, 2, 2)  # the same point twice
-    mean, _ = propagate("rbf", model, factorise_all("rbf", model), whitened, x, generator)
+    mean, _ = propagate(factorise_all(model), whitened, x, generator)
     correlation = np.corrcoef(mean[..., 0].numpy().T)[0, 1]
     assert abs(correlation) < 5 / np.sqrt(5000)
     assert len(mean.unique()) == mean.numel()

@@ -5,23 +5,23 @@ import pytest
 import torch
 
 from gym_dgpmpc.gp.kernels import KERNELS
-from gym_dgpmpc.gp.layer import conditional, factorise, joint_conditional
+from gym_dgpmpc.gp.layer import Layer, conditional, factorise, joint_conditional
 from tests.oracles import gaussian_process
 from tests.oracles.models import dense, make_model, normal, seeded
 
 TOLERANCE = 1e-8  # float64 rounding times the condition number of K_zz, at most M / jitter = 1e7
 
 
-def case(*batch, num_points=4):
+def case(kernel, *batch, num_points=4):
     generator = seeded(1)
-    layer = make_model(1, 3, 2, 7, generator).layers[0]
+    layer = make_model(1, 3, 2, 7, generator, kernel).layers[0]
     return layer, normal(generator, *batch, 7, 2), normal(generator, *batch, num_points, 3)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_the_factor_is_that_of_the_inducing_covariance(kernel):
-    layer, _, _ = case()
-    factor = factorise(kernel, layer)
+    layer, _, _ = case(kernel)
+    factor = factorise(layer)
     exact = gaussian_process.inducing_covariance(kernel, dense(layer))
     np.testing.assert_allclose(factor @ factor.mT, exact, atol=1e-13)
 
@@ -29,22 +29,22 @@ def test_the_factor_is_that_of_the_inducing_covariance(kernel):
 @pytest.mark.parametrize("batch", [(), (3,)])
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_conditionals_are_those_of_the_joint_gaussian(kernel, batch):
-    layer, v, x = case(*batch)
-    factor = factorise(kernel, layer)
+    layer, v, x = case(kernel, *batch)
+    factor = factorise(layer)
     exact_mean, exact_covariance = gaussian_process.conditional(kernel, dense(layer), v.numpy(), x.numpy())
-    mean, covariance = joint_conditional(kernel, layer, factor, v, x)
+    mean, covariance = joint_conditional(layer, factor, v, x)
     np.testing.assert_allclose(mean, exact_mean, atol=TOLERANCE)
     np.testing.assert_allclose(covariance, exact_covariance, atol=TOLERANCE)
-    mean, variance = conditional(kernel, layer, factor, v, x)
+    mean, variance = conditional(layer, factor, v, x)
     np.testing.assert_allclose(mean, exact_mean, atol=TOLERANCE)
     np.testing.assert_allclose(variance, np.diagonal(exact_covariance, axis1=-2, axis2=-1), atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_at_the_inducing_inputs_the_function_is_the_inducing_outputs(kernel):
-    layer, v, _ = case()
-    factor = factorise(kernel, layer)
-    mean, variance = conditional(kernel, layer, factor, v, layer.inducing_inputs)
+    layer, v, _ = case(kernel)
+    factor = factorise(layer)
+    mean, variance = conditional(layer, factor, v, layer.inducing_inputs)
     # What the jitter of 1e-6 leaves: j alpha in the mean, at most j sigma^2 in the variance.
     alpha = torch.linalg.solve_triangular(factor.mT, v, upper=True).abs().max()
     assert (mean - factor @ v).abs().max() < 2e-6 * float(layer.variance * alpha)
@@ -54,19 +54,19 @@ def test_at_the_inducing_inputs_the_function_is_the_inducing_outputs(kernel):
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_far_from_the_inducing_inputs_the_prior_is_left(kernel):
-    layer, v, x = case()
-    mean, variance = conditional(kernel, layer, factorise(kernel, layer), v, x + 1e3)
+    layer, v, x = case(kernel)
+    mean, variance = conditional(layer, factorise(layer), v, x + 1e3)
     torch.testing.assert_close(mean, torch.zeros_like(mean), rtol=0, atol=1e-9)
     torch.testing.assert_close(variance, layer.variance.expand(4), rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_the_gradient_reaches_hyperparameters_and_inducing_points(kernel):
-    layer, v, x = case(num_points=2)
-    tensors = [t.detach().clone().requires_grad_() for t in (*layer, v)]
+    layer, v, x = case(kernel, num_points=2)
+    tensors = [t.detach().clone().requires_grad_() for t in (*layer.parameters().values(), v)]
 
     def outputs(inducing_inputs, log_lengthscale, log_variance, whitened):
-        moved = type(layer)(inducing_inputs, log_lengthscale, log_variance)
-        return conditional(kernel, moved, factorise(kernel, moved), whitened, x)
+        moved = Layer(layer.kernel, inducing_inputs, log_lengthscale, log_variance)
+        return conditional(moved, factorise(moved), whitened, x)
 
     assert torch.autograd.gradcheck(outputs, tensors)

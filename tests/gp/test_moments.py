@@ -7,6 +7,7 @@ import pytest
 import scipy.integrate
 import torch
 
+from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.gp.layer import Layer
 from gym_dgpmpc.gp.moments import Predictor, predicted_moments
 from gym_dgpmpc.gp.sgpr import shrinkage, sparse_posterior, sparse_predict
@@ -18,14 +19,16 @@ def trained(input_size, num_targets=2, seed=0):
     generator = seeded(seed)
     x, y = 1.5 * normal(generator, 30, input_size), normal(generator, 30, num_targets)
     lengthscale = 0.8 + torch.rand(input_size, generator=generator, dtype=torch.float64)
-    layer = Layer(1.5 * normal(generator, 8, input_size), lengthscale.log(), torch.tensor(1.3).double().log())
+    layer = Layer(
+        KERNELS["rbf"], 1.5 * normal(generator, 8, input_size), lengthscale.log(), torch.tensor(1.3).double().log()
+    )
     noise = 0.05 + 0.1 * torch.rand(num_targets, generator=generator, dtype=torch.float64)
-    posterior = sparse_posterior("rbf", layer, noise, x, y)
+    posterior = sparse_posterior(layer, noise, x, y)
     basis, removed = posterior.basis, shrinkage(posterior, noise).mT.unsqueeze(-1)
     predictor = Predictor(
         layer.inducing_inputs, lengthscale, layer.variance, basis.mT @ posterior.mean, basis.mT @ (removed * basis)
     )
-    return lambda x: sparse_predict("rbf", layer, noise, posterior, x), predictor
+    return lambda x: sparse_predict(layer, noise, posterior, x), predictor
 
 
 def gaussian(input_size, count=3, seed=1):

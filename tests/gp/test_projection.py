@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gym_dgpmpc.gp.kernels import KERNELS, correlation, sqdist
+from gym_dgpmpc.gp.kernels import KERNELS, sqdist
 from gym_dgpmpc.gp.linalg import cholesky
 from gym_dgpmpc.gp.projection import projection
 
@@ -11,7 +11,7 @@ M, D, N, P = 5, 2, 4, 3
 
 
 def factor_of(kernel, z):
-    return cholesky(correlation(kernel, sqdist(z, z)), torch.ones((), dtype=z.dtype))
+    return cholesky(KERNELS[kernel].correlation(sqdist(z, z)), torch.ones((), dtype=z.dtype))
 
 
 def points(*shape):
@@ -24,7 +24,9 @@ def points(*shape):
 def test_the_gradient_is_that_of_finite_differences(kernel, batch):
     x, z = points(*batch, N, D).requires_grad_(), points(M, D).requires_grad_()
     # The factor depends on z, but no gradient is to flow through it.
-    assert torch.autograd.gradcheck(lambda x, z: projection(kernel, x, z, factor_of(kernel, z.detach())), (x, z))
+    assert torch.autograd.gradcheck(
+        lambda x, z: projection(KERNELS[kernel], x, z, factor_of(kernel, z.detach())), (x, z)
+    )
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -32,9 +34,13 @@ def test_the_gradient_is_that_of_automatic_differentiation(kernel):
     """Also where gradcheck's small steps could hide an error: at many points, to rounding."""
     z, x = points(40, D).requires_grad_(), points(60, D).requires_grad_()
     weights = points(40, 60)
-    plain = torch.linalg.solve_triangular(factor_of(kernel, z), correlation(kernel, sqdist(x, z)).mT, upper=False)
+    plain = torch.linalg.solve_triangular(
+        factor_of(kernel, z), KERNELS[kernel].correlation(sqdist(x, z)).mT, upper=False
+    )
     expected = torch.autograd.grad((weights * plain).sum(), (x, z))
-    found = torch.autograd.grad((weights * projection(kernel, x, z, factor_of(kernel, z.detach()))).sum(), (x, z))
+    found = torch.autograd.grad(
+        (weights * projection(KERNELS[kernel], x, z, factor_of(kernel, z.detach()))).sum(), (x, z)
+    )
     for a, b in zip(found, expected, strict=True):
         # The solves amplify rounding by the condition number, at most M / jitter.
         torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6 * float(b.detach().abs().max()))
@@ -42,5 +48,5 @@ def test_the_gradient_is_that_of_automatic_differentiation(kernel):
 
 def test_only_what_is_asked_for_is_computed():
     z, x = points(M, D), points(N, D).requires_grad_()
-    projection("matern32", x, z, factor_of("matern32", z)).sum().backward()
+    projection(KERNELS["matern32"], x, z, factor_of("matern32", z)).sum().backward()
     assert x.grad is not None and z.grad is None

@@ -15,9 +15,9 @@ from tests.oracles import gaussian_process
 from tests.oracles.models import dense, make_model, normal, seeded
 
 
-def case():
+def case(kernel):
     generator = seeded(2)
-    model = make_model(1, 2, 3, 5, generator)
+    model = make_model(1, 2, 3, 5, generator, kernel)
     return model, normal(generator, 12, 2), normal(generator, 12, 3), normal(generator, 4, 2)
 
 
@@ -30,7 +30,7 @@ def log_normal(y, covariance):
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_the_bound_is_titsias(kernel):
     """log N(y | 0, Q + s I) - tr(K - Q) / 2 s with Q = K_xz (K_zz + jitter)^-1 K_zx, summed over the outputs."""
-    model, x, y, _ = case()
+    model, x, y, _ = case(kernel)
     layer, points = dense(model.layers[0]), x.numpy()
     K_xz = gaussian_process.covariance(kernel, layer, points, layer.inducing_inputs)
     Q = K_xz @ np.linalg.solve(gaussian_process.inducing_covariance(kernel, layer), K_xz.T)
@@ -39,19 +39,19 @@ def test_the_bound_is_titsias(kernel):
         log_normal(y[:, t].numpy(), Q + noise * np.eye(12)) - lost / (2 * noise)
         for t, noise in enumerate(model.noise_variance.numpy())
     )
-    found = collapsed_bound(kernel, model.layers[0], model.noise_variance, x, y)
+    found = collapsed_bound(model.layers[0], model.noise_variance, x, y)
     assert float(found) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_it_is_a_lower_bound_and_tight_where_the_data_are_the_inducing_inputs(kernel):
-    model, x, y, _ = case()
+    model, x, y, _ = case(kernel)
     layer = dense(model.layers[0])
     K = gaussian_process.covariance(kernel, layer, x.numpy(), x.numpy())
     noises = model.noise_variance.numpy()
     evidence = sum(log_normal(y[:, t].numpy(), K + noise * np.eye(12)) for t, noise in enumerate(noises))
-    assert float(collapsed_bound(kernel, model.layers[0], model.noise_variance, x, y)) < evidence
-    tight = collapsed_bound(kernel, model.layers[0]._replace(inducing_inputs=x), model.noise_variance, x, y)
+    assert float(collapsed_bound(model.layers[0], model.noise_variance, x, y)) < evidence
+    tight = collapsed_bound(model.layers[0]._replace(inducing_inputs=x), model.noise_variance, x, y)
     # To first order in the jitter j, K - Q is j I: it costs j / 2s (1 + 1 + |y|^2 / s) a datum at the most.
     jitter = JITTER * layer.variance
     slack = sum(
@@ -63,23 +63,23 @@ def test_it_is_a_lower_bound_and_tight_where_the_data_are_the_inducing_inputs(ke
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_its_gradient_is_complete(kernel):
     """Finite differences see the factorisation of K_zz; the gradient must, although none flows through the factor."""
-    model, x, y, _ = case()
+    model, x, y, _ = case(kernel)
 
     def bound(*parameters):
         *layer, log_noise = parameters
-        return collapsed_bound(kernel, Layer(*layer), log_noise.exp(), x, y)
+        return collapsed_bound(Layer(model.layers[0].kernel, *layer), log_noise.exp(), x, y)
 
-    parameters = [tensor.clone().requires_grad_() for tensor in (*model.layers[0], model.log_noise)]
+    parameters = [tensor.clone().requires_grad_() for tensor in model.parameters()]
     assert torch.autograd.gradcheck(bound, parameters, eps=1e-6, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_predictions_are_titsias(kernel):
     """mean k_*z S K_zx y / s, variance k_** - k_*z (K_zz^-1 - S) k_z* with S = (K_zz + K_zx K_xz / s)^-1."""
-    model, x, y, x_new = case()
+    model, x, y, x_new = case(kernel)
     layer = dense(model.layers[0])
-    posterior = sparse_posterior(kernel, model.layers[0], model.noise_variance, x, y)
-    mean, variance = sparse_predict(kernel, model.layers[0], model.noise_variance, posterior, x_new)
+    posterior = sparse_posterior(model.layers[0], model.noise_variance, x, y)
+    mean, variance = sparse_predict(model.layers[0], model.noise_variance, posterior, x_new)
     K_zz = gaussian_process.inducing_covariance(kernel, layer)
     K_zx = gaussian_process.covariance(kernel, layer, layer.inducing_inputs, x.numpy())
     K_nz = gaussian_process.covariance(kernel, layer, x_new.numpy(), layer.inducing_inputs)
@@ -92,10 +92,10 @@ def test_predictions_are_titsias(kernel):
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_with_the_data_as_inducing_inputs_it_is_exact(kernel):
-    model, x, y, x_new = case()
+    model, x, y, x_new = case(kernel)
     layer = model.layers[0]._replace(inducing_inputs=x)
-    posterior = sparse_posterior(kernel, layer, model.noise_variance, x, y)
-    mean, variance = sparse_predict(kernel, layer, model.noise_variance, posterior, x_new)
-    regression = exact.regression(kernel, layer, model.noise_variance, x, y, x_new)
+    posterior = sparse_posterior(layer, model.noise_variance, x, y)
+    mean, variance = sparse_predict(layer, model.noise_variance, posterior, x_new)
+    regression = exact.regression(layer, model.noise_variance, x, y, x_new)
     torch.testing.assert_close(mean, regression.mean, rtol=0, atol=1e-4)
     torch.testing.assert_close(variance, regression.covariance.diagonal(dim1=-2, dim2=-1).mT, rtol=0, atol=1e-4)

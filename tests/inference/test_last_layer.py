@@ -3,13 +3,15 @@
 import pytest
 import torch
 
+from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
 from gym_dgpmpc.gp.exact import whitened_posterior
+from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.gp.layer import Layer
 from gym_dgpmpc.inference import mcem, sghmc
 from gym_dgpmpc.inference.last_layer import last_layer_posterior
-from gym_dgpmpc.inference.mcem import Data, InferenceSettings
+from gym_dgpmpc.inference.mcem import InferenceSettings
 
 M, D, T, N = 7, 2, 3, 30
 
@@ -19,10 +21,10 @@ def generator():
     return torch.Generator().manual_seed(0)
 
 
-def deep_gp(num_layers, generator):
+def deep_gp(num_layers, generator, kernel="matern32"):
     def layer(log_variance):
         centres = torch.randn(M, D, generator=generator, dtype=torch.float64)
-        return Layer(centres, torch.tensor([0.1, -0.2]).double(), torch.tensor(log_variance).double())
+        return Layer(KERNELS[kernel], centres, torch.tensor([0.1, -0.2]).double(), torch.tensor(log_variance).double())
 
     layers = tuple(layer(-3.0) for _ in range(num_layers - 1))
     return DeepGP((*layers, layer(0.3)), torch.tensor([-2.0, -3.0, -1.0]).double())
@@ -35,19 +37,17 @@ def toy(generator):
 
 @pytest.mark.parametrize("kernel", ["rbf", "matern12"])
 def test_one_layer_is_the_closed_form(kernel, generator):
-    model, (x, y) = deep_gp(1, generator), toy(generator)
-    factors = factorise_all(kernel, model)
-    exact = whitened_posterior(kernel, model.layers[0], factors[0], model.noise_variance, x, y)
-    found = last_layer_posterior(kernel, model, factors, torch.zeros(M * T).double(), x, y, generator)
+    model, (x, y) = deep_gp(1, generator, kernel), toy(generator)
+    factorised = factorise_all(model)
+    exact = whitened_posterior(model.layers[0], factorised.factors[0], model.noise_variance, x, y)
+    found = last_layer_posterior(factorised, torch.zeros(M * T).double(), x, y, generator)
     torch.testing.assert_close(found.mean.mT, exact.mean, rtol=0, atol=1e-10)
     torch.testing.assert_close(torch.cholesky_inverse(found.precision_factor), exact.covariance, rtol=0, atol=1e-10)
 
 
 def test_samples_have_the_posterior_moments(generator):
     model, (x, y) = deep_gp(1, generator), toy(generator)
-    posterior = last_layer_posterior(
-        "matern32", model, factorise_all("matern32", model), torch.zeros(M * T).double(), x, y, generator
-    )
+    posterior = last_layer_posterior(factorise_all(model), torch.zeros(M * T).double(), x, y, generator)
     num = 40_000
     samples = posterior.sample(num, generator)
     assert samples.shape == (num, M, T)
@@ -62,19 +62,19 @@ def test_samples_have_the_posterior_moments(generator):
 
 def test_weight_counts_a_datum_as_often(generator):
     model, (x, y) = deep_gp(1, generator), toy(generator)
-    factors, start = factorise_all("matern32", model), torch.zeros(M * T).double()
-    weighted = last_layer_posterior("matern32", model, factors, start, x, y, generator, weight=2.0)
-    twice = last_layer_posterior("matern32", model, factors, start, x.repeat(2, 1), y.repeat(2, 1), generator)
+    factorised, start = factorise_all(model), torch.zeros(M * T).double()
+    weighted = last_layer_posterior(factorised, start, x, y, generator, weight=2.0)
+    twice = last_layer_posterior(factorised, start, x.repeat(2, 1), y.repeat(2, 1), generator)
     torch.testing.assert_close(weighted.mean, twice.mean)
     torch.testing.assert_close(weighted.precision_factor, twice.precision_factor)
 
 
 def test_a_precision_that_rounding_spoils_is_an_error(generator):
     """Never a posterior under a prior that is stronger than the model's."""
-    model, (x, y) = deep_gp(1, generator), toy(generator)
-    factors = factorise_all("rbf", model)
+    model, (x, y) = deep_gp(1, generator, "rbf"), toy(generator)
+    factorised = factorise_all(model)
     with pytest.raises(FactorisationError):
-        last_layer_posterior("rbf", model, factors, torch.zeros(M * T).double(), x[:2], y[:2], generator, weight=1e19)
+        last_layer_posterior(factorised, torch.zeros(M * T).double(), x[:2], y[:2], generator, weight=1e19)
 
 
 def test_gibbs_step_moves_the_last_layer_alone(generator):
@@ -82,7 +82,7 @@ def test_gibbs_step_moves_the_last_layer_alone(generator):
     start = sghmc.init(torch.randn(model.num_whitened(), generator=generator, dtype=torch.float64))
     start = start._replace(momentum=torch.ones_like(start.position))
     settings = InferenceSettings()
-    after = mcem.gibbs_step("matern32", model, factorise_all("matern32", model), start, Data(x, y), generator, settings)
+    after = mcem.gibbs_step(factorise_all(model), start, Data(x, y), generator, settings)
     inner = model.num_inner()
     assert inner == M * D
     torch.testing.assert_close(after.position[:inner], start.position[:inner], rtol=0, atol=0)
@@ -94,21 +94,19 @@ def test_gibbs_step_moves_the_last_layer_alone(generator):
 def test_last_layer_is_laid_out_as_the_model_reads_it(generator):
     """A draw explains the data: through the model its mean prediction beats the prior's by far."""
     model, (x, y) = deep_gp(2, generator), toy(generator)
-    factors = factorise_all("matern32", model)
+    factorised = factorise_all(model)
     chain = sghmc.init(torch.zeros(model.num_whitened()).double())
     settings = InferenceSettings()
-    before = mcem.negative_log_joint("matern32", model, factors, chain.position, Data(x, y), N, generator)
-    position = mcem.gibbs_step("matern32", model, factors, chain, Data(x, y), generator, settings).position
-    after = mcem.negative_log_joint("matern32", model, factors, position, Data(x, y), N, generator)
+    before = mcem.negative_log_joint(factorised, chain.position, Data(x, y), N, generator)
+    position = mcem.gibbs_step(factorised, chain, Data(x, y), generator, settings).position
+    after = mcem.negative_log_joint(factorised, position, Data(x, y), N, generator)
     assert after < before - 1.0
 
 
 def test_repeated_draws_share_the_inner_layers(generator):
     model, (x, y) = deep_gp(2, generator), toy(generator)
     chain = sghmc.init(torch.randn(model.num_whitened(), generator=generator, dtype=torch.float64))
-    positions = mcem.gibbs_positions(
-        "matern32", model, factorise_all("matern32", model), chain, Data(x, y), 4, generator, InferenceSettings()
-    )
+    positions = mcem.gibbs_positions(factorise_all(model), chain, Data(x, y), 4, generator, InferenceSettings())
     assert positions.shape == (4, model.num_whitened())
     inner = model.num_inner()
     assert (positions[:, :inner] == chain.position[:inner]).all()

@@ -4,10 +4,11 @@ import math
 
 import torch
 
+from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.dynamics.deep_gp.start import initial_model
+from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.gp.sgpr import collapsed_bound
 from gym_dgpmpc.inference.lbfgs import LENGTHSCALES, NOISE_VARIANCES, maximise_bound
-from gym_dgpmpc.inference.mcem import Data
 from tests.oracles.models import normal, seeded
 
 
@@ -22,14 +23,13 @@ def test_it_climbs_to_a_stationary_point_and_finds_the_noise():
     """The maximum-likelihood variance of Gaussian noise has the standard error s sqrt(2 / N); degrees of freedom of
     the fit, some 15 of 120 for the first output, lower it further."""
     data, generator = problem()
-    start = initial_model(data, 1, 15, generator)
-    found = maximise_bound("rbf", start, data, 300)
-    before = collapsed_bound("rbf", start.layers[0], start.noise_variance, *data) / data.y.numel()
+    start = initial_model(KERNELS["rbf"], data, 1, 15, generator)
+    found = maximise_bound(start, data, 300)
+    before = collapsed_bound(start.layers[0], start.noise_variance, *data) / data.y.numel()
     assert found.bound > float(before)
     parameters = [tensor.clone().requires_grad_() for tensor in found.model.parameters()]
-    *layer, log_noise = parameters
-    model = found.model._replace(layers=(type(start.layers[0])(*layer),), log_noise=log_noise)
-    value = collapsed_bound("rbf", model.layers[0], model.noise_variance, *data) / data.y.numel()
+    model = found.model.with_parameters(parameters)
+    value = collapsed_bound(model.layers[0], model.noise_variance, *data) / data.y.numel()
     assert abs(float(value.detach()) - found.bound) < 1e-12
     gradients = torch.cat([g.flatten() for g in torch.autograd.grad(value, parameters)])
     # The second input changes nothing, so its lengthscale climbs towards infinity, where the slope vanishes too.
@@ -42,24 +42,24 @@ def test_it_climbs_to_a_stationary_point_and_finds_the_noise():
 
 def test_frozen_inducing_inputs_stay():
     data, generator = problem()
-    start = initial_model(data, 1, 15, generator)
-    found = maximise_bound("matern32", start, data, 20, free_inducing_inputs=False)
+    start = initial_model(KERNELS["matern32"], data, 1, 15, generator)
+    found = maximise_bound(start, data, 20, free_inducing_inputs=False)
     assert torch.equal(found.model.layers[0].inducing_inputs, start.layers[0].inducing_inputs)
-    free = maximise_bound("matern32", start, data, 20)
+    free = maximise_bound(start, data, 20)
     assert not torch.equal(free.model.layers[0].inducing_inputs, start.layers[0].inducing_inputs)
 
 
 def test_hyperparameters_stay_within_bounds():
     """Data without noise would take the noise to zero."""
     data, generator = problem(num_data=40, noise=0.0)
-    found = maximise_bound("rbf", initial_model(data, 1, 40, generator), data, 200)
+    found = maximise_bound(initial_model(KERNELS["rbf"], data, 1, 40, generator), data, 200)
     assert bool((found.model.log_noise >= math.log(NOISE_VARIANCES[0]) - 1e-9).all())
     assert bool((found.model.layers[0].lengthscale <= LENGTHSCALES[1] * (1 + 1e-9)).all())
 
 
 def test_it_starts_within_bounds_and_says_how_often_it_looked():
     data, generator = problem(num_data=30)
-    start = initial_model(data, 1, 10, generator)
+    start = initial_model(KERNELS["rbf"], data, 1, 10, generator)
     start = start._replace(log_noise=torch.full_like(start.log_noise, -100.0))
-    found = maximise_bound("rbf", start, data, 1)
+    found = maximise_bound(start, data, 1)
     assert math.isfinite(found.bound) and found.num_evaluations >= 1

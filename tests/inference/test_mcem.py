@@ -5,29 +5,30 @@ import pytest
 import scipy.stats
 import torch
 
+from gym_dgpmpc.data.standardised import Data, minibatch
 from gym_dgpmpc.gp import exact
 from gym_dgpmpc.gp.deep_gp import factorise_all
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.inference import mcem, sghmc
 from gym_dgpmpc.inference.diagnostics import effective_sample_size
-from gym_dgpmpc.inference.mcem import Data, InferenceSettings, minibatch
+from gym_dgpmpc.inference.mcem import InferenceSettings
 from tests.oracles import sghmc as oracle
 from tests.oracles.models import make_model, normal, seeded
 
 
-def one_layer(num_data=8):
+def one_layer(kernel="rbf", num_data=8):
     """A model with fixed hyperparameters, data, and the exact posterior of v in the layout of the flat vector."""
     generator = seeded(5)
-    model = make_model(1, 2, 2, 5, generator)
+    model = make_model(1, 2, 2, 5, generator, kernel)
     model = model._replace(log_noise=torch.tensor([0.3, 0.6], dtype=torch.float64).log())
     data = Data(normal(generator, num_data, 2), normal(generator, num_data, 2))
     return model, data
 
 
-def flat_posterior(kernel, model, data):
+def flat_posterior(model, data):
     """Mean [V] and precision [V, V]: outputs are independent, and neighbours in the flat vector."""
-    (factor,) = factorise_all(kernel, model)
-    posterior = exact.whitened_posterior(kernel, model.layers[0], factor, model.noise_variance, *data)
+    (factor,) = factorise_all(model).factors
+    posterior = exact.whitened_posterior(model.layers[0], factor, model.noise_variance, *data)
     num_inducing, outputs = posterior.mean.shape
     precision = torch.zeros(num_inducing, outputs, num_inducing, outputs, dtype=torch.float64)
     for output in range(outputs):
@@ -37,21 +38,21 @@ def flat_posterior(kernel, model, data):
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_the_gradient_is_that_of_the_closed_form_posterior(kernel):
-    model, data = one_layer()
-    mean, precision = flat_posterior(kernel, model, data)
+    model, data = one_layer(kernel)
+    mean, precision = flat_posterior(model, data)
     v = normal(seeded(1), len(mean)).requires_grad_()
-    value = mcem.negative_log_joint(kernel, model, factorise_all(kernel, model), v, data, 8, seeded())
+    value = mcem.negative_log_joint(factorise_all(model), v, data, 8, seeded())
     (gradient,) = torch.autograd.grad(value, v)
     torch.testing.assert_close(gradient, precision @ (v.detach() - mean) / 8, rtol=1e-8, atol=1e-10)
 
 
 def test_gradients_of_minibatches_are_unbiased():
     """Without hidden noise (one layer) the mean over all batches of one row is the full gradient exactly."""
-    model, data = one_layer()
-    factors, v = factorise_all("matern32", model), normal(seeded(1), model.num_whitened()).requires_grad_()
+    model, data = one_layer("matern32")
+    factorised, v = factorise_all(model), normal(seeded(1), model.num_whitened()).requires_grad_()
 
     def gradient(batch):
-        value = mcem.negative_log_joint("matern32", model, factors, v, batch, len(data.x), seeded())
+        value = mcem.negative_log_joint(factorised, v, batch, len(data.x), seeded())
         return torch.autograd.grad(value, v)[0]
 
     singles = [gradient(Data(x, y)) for x, y in zip(data.x.split(1), data.y.split(1), strict=True)]
@@ -72,8 +73,8 @@ def test_minibatches_are_drawn_uniformly_and_keep_rows_together():
 @pytest.mark.parametrize(("kernel", "num_data"), [("rbf", 8), ("matern32", 24)])
 def test_samples_follow_the_closed_form_posterior(kernel, num_data):
     """Mean and covariance of v, tolerances from the chain's exact autocovariances, its step-size bias included."""
-    model, data = one_layer(num_data)
-    mean, precision = flat_posterior(kernel, model, data)
+    model, data = one_layer(kernel, num_data)
+    mean, precision = flat_posterior(model, data)
     hessian = precision.numpy() / num_data
     inverse_mass = 1.0 / np.diagonal(hessian).copy()
     settings = InferenceSettings(step_size=0.6, decay=0.4, gibbs_every=0)
@@ -83,7 +84,7 @@ def test_samples_follow_the_closed_form_posterior(kernel, num_data):
 
     num_samples, spacing, burn_in = 1200, 2, 30
     start = sghmc.init(mean)._replace(square=torch.from_numpy(inverse_mass) ** -2)
-    chains = list(mcem.sample(kernel, model, start, data, burn_in + num_samples, spacing, seeded(), settings))
+    chains = list(mcem.sample(factorise_all(model), start, data, burn_in + num_samples, spacing, seeded(), settings))
     samples = torch.stack([chain.position for chain in chains[burn_in:]]).numpy()
     lags = np.concatenate([np.swapaxes(lags[spacing::spacing], 1, 2), lags[::spacing]])  # both directions of time
     error = samples.mean(0) - mean.numpy()
@@ -107,20 +108,16 @@ def test_samples_follow_the_closed_form_posterior(kernel, num_data):
 def test_sampling_keeps_the_preconditioner_and_the_spacing():
     model, data = one_layer()
     start = sghmc.init(torch.zeros(model.num_whitened(), dtype=torch.float64))
-    every = list(mcem.sample("rbf", model, start, data, 6, 1, seeded(), InferenceSettings(gibbs_every=0)))
-    second = list(mcem.sample("rbf", model, start, data, 3, 2, seeded(), InferenceSettings(gibbs_every=0)))
+    every = list(mcem.sample(factorise_all(model), start, data, 6, 1, seeded(), InferenceSettings(gibbs_every=0)))
+    second = list(mcem.sample(factorise_all(model), start, data, 3, 2, seeded(), InferenceSettings(gibbs_every=0)))
     for a, b in zip(every[1::2], second, strict=True):
         assert torch.equal(a.position, b.position)
         assert torch.equal(b.square, start.square) and torch.equal(b.averaging, start.averaging)
-    given = mcem.sample(
-        "rbf", model, start, data, 3, 2, seeded(), InferenceSettings(gibbs_every=0), factorise_all("rbf", model)
-    )
-    assert all(torch.equal(a.position, b.position) for a, b in zip(given, second, strict=True))
 
 
 def test_the_prior_weighs_less_the_more_data_there_are():
     """With a batch that repeats the same rows only |v|^2 / (2 N) changes with N."""
     model, data = one_layer()
-    factors, v = factorise_all("rbf", model), normal(seeded(1), model.num_whitened())
-    values = [mcem.negative_log_joint("rbf", model, factors, v, data, n, seeded()).item() for n in (8, 80)]
+    factorised, v = factorise_all(model), normal(seeded(1), model.num_whitened())
+    values = [mcem.negative_log_joint(factorised, v, data, n, seeded()).item() for n in (8, 80)]
     assert values[0] - values[1] == pytest.approx(0.5 * v.square().sum().item() * (1 / 8 - 1 / 80), rel=1e-10)

@@ -5,10 +5,13 @@ import math
 import pytest
 import torch
 
+from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.dynamics.deep_gp.start import initial_model
 from gym_dgpmpc.errors import FactorisationError, TrainingError
+from gym_dgpmpc.gp.deep_gp import factorise_all
+from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.inference import mcem, sghmc, training
-from gym_dgpmpc.inference.mcem import Data, InferenceSettings
+from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.inference.training import predictive_log_likelihood, train
 from tests.oracles.models import normal, seeded
 
@@ -26,17 +29,17 @@ def waves(num_data, seed):
 def test_training_learns_the_function_and_its_noise(num_layers):
     data, test = waves(150, 0), waves(400, 1)
     settings = InferenceSettings(step_size=0.03, learning_rate=0.02, batch_size=100, window_size=50)
-    start = initial_model(data, num_layers, 12, seeded())
+    start = initial_model(KERNELS["matern52"], data, num_layers, 12, seeded())
     chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
     generator = seeded()
-    trained = train("matern52", start, chain, data, 500, generator, settings)
-    samples = mcem.sample("matern52", trained.model, trained.chain, data, 20, 5, generator, settings)
+    trained = train(start, chain, data, 500, generator, settings)
+    samples = mcem.sample(factorise_all(trained.model), trained.chain, data, 20, 5, generator, settings)
     positions = torch.stack([chain.position for chain in samples])
 
     # Knowing function and noise exactly would score -log(noise) - 1.42 for each of two targets, on average.
     best = 2 * (-math.log(NOISE) - 0.5 * math.log(2 * math.pi * math.e))
-    before = predictive_log_likelihood("matern52", start, chain.position.unsqueeze(0), test, seeded(9))
-    after = predictive_log_likelihood("matern52", trained.model, positions, test, seeded(9))
+    before = predictive_log_likelihood(factorise_all(start), chain.position.unsqueeze(0), test, seeded(9))
+    after = predictive_log_likelihood(factorise_all(trained.model), positions, test, seeded(9))
     assert before < best - 2.0
     # The mean over 400 test points errs by 2^1/2 / 20; what is not known of the function costs about as much.
     assert best - 0.25 < after < best + 0.2
@@ -48,10 +51,10 @@ def test_training_learns_the_function_and_its_noise(num_layers):
 
 def test_training_moves_every_hyperparameter_and_nothing_it_was_given():
     data = waves(30, 0)
-    start = initial_model(data, 2, 5, seeded())
+    start = initial_model(KERNELS["rbf"], data, 2, 5, seeded())
     before = [p.clone() for p in start.parameters()]
     chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
-    trained = train("rbf", start, chain, data, 3, seeded(), InferenceSettings())
+    trained = train(start, chain, data, 3, seeded(), InferenceSettings())
     for kept, given, moved in zip(before, start.parameters(), trained.model.parameters(), strict=True):
         assert torch.equal(kept, given)
         assert moved.isfinite().all() and not torch.equal(moved, kept) and not moved.requires_grad
@@ -63,9 +66,9 @@ def test_the_same_seed_gives_the_same_result(num_data):
     data, settings = waves(num_data, 0), InferenceSettings(batch_size=16)
     results = []
     for seed in (0, 0, 1):
-        start = initial_model(data, 2, 5, seeded(seed))
+        start = initial_model(KERNELS["matern12"], data, 2, 5, seeded(seed))
         chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
-        results.append(train("matern12", start, chain, data, 4, seeded(seed), settings))
+        results.append(train(start, chain, data, 4, seeded(seed), settings))
     first, again, other = results
     assert first.negative_log_joint == again.negative_log_joint
     assert all(torch.equal(a, b) for a, b in zip(first.chain, again.chain, strict=True))
@@ -76,26 +79,26 @@ def test_the_same_seed_gives_the_same_result(num_data):
 def test_the_window_holds_the_latest_positions_and_no_others():
     """A window that is not yet full is used as far as it goes; one of a single position is the chain's own."""
     data = waves(20, 0)
-    start = initial_model(data, 1, 5, seeded())
+    start = initial_model(KERNELS["rbf"], data, 1, 5, seeded())
     chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
 
     def lengthscale(window_size):
         settings = InferenceSettings(step_size=0.1, window_size=window_size)
-        return train("rbf", start, chain, data, 6, seeded(), settings).model.layers[0].log_lengthscale
+        return train(start, chain, data, 6, seeded(), settings).model.layers[0].log_lengthscale
 
     assert torch.equal(lengthscale(6), lengthscale(600))
     assert not torch.equal(lengthscale(6), lengthscale(1))
 
 
-def started(data, num_layers=2, num_inducing=10):
-    model = initial_model(data, num_layers, num_inducing, seeded())
+def started(data, num_layers=2, kernel="rbf"):
+    model = initial_model(KERNELS[kernel], data, num_layers, 10, seeded())
     return model, sghmc.init(torch.zeros(model.num_whitened(), dtype=torch.float64))
 
 
 def test_hyperparameters_move_as_often_as_asked():
     data = waves(30, 0)
     model, chain = started(data)
-    run = mcem.MCEM("rbf", model, chain, data, InferenceSettings(hyperparameters_every=3))
+    run = mcem.MCEM(model, chain, data, InferenceSettings(hyperparameters_every=3))
     generator, moved = seeded(), []
     for _ in range(7):
         before = [p.clone() for p in run.model.parameters()]
@@ -106,8 +109,8 @@ def test_hyperparameters_move_as_often_as_asked():
 
 def test_a_snapshot_is_everything_that_a_step_moves():
     data = waves(30, 0)
-    model, chain = started(data)
-    run = mcem.MCEM("matern52", model, chain, data, InferenceSettings(window_size=4))
+    model, chain = started(data, kernel="matern52")
+    run = mcem.MCEM(model, chain, data, InferenceSettings(window_size=4))
     for _ in range(3):
         run.step(seeded())
     kept = run.snapshot()
@@ -136,8 +139,8 @@ def test_a_run_that_diverges_goes_back_and_takes_smaller_steps(step_size):
     """
     data = waves(60, 0)
     settings = InferenceSettings(step_size=step_size, look_every=20, gibbs_every=0)
-    start = mcem.MCEM("matern32", *started(data), data, settings).evaluate(seeded())
-    trained = train("matern32", *started(data), data, 200, seeded(), settings)
+    start = mcem.MCEM(*started(data, kernel="matern32"), data, settings).evaluate(seeded())
+    trained = train(*started(data, kernel="matern32"), data, 200, seeded(), settings)
     assert 1 <= trained.num_rollbacks <= training.MAX_ROLLBACKS
     assert trained.settings.step_size == step_size / 2**trained.num_rollbacks
     assert trained.settings.learning_rate == settings.learning_rate / 2**trained.num_rollbacks
@@ -150,7 +153,7 @@ def test_a_run_that_diverges_goes_back_and_takes_smaller_steps(step_size):
 def test_a_run_that_cannot_be_saved_says_so():
     data = waves(60, 0)
     with pytest.raises(TrainingError, match=r"diverged 6 times.*step size 3\.125: .*60 transitions"):
-        train("matern32", *started(data), data, 100, seeded(), InferenceSettings(step_size=100.0, gibbs_every=0))
+        train(*started(data, kernel="matern32"), data, 100, seeded(), InferenceSettings(step_size=100.0, gibbs_every=0))
 
 
 def test_a_covariance_that_cannot_be_factorised_is_gone_back_from(monkeypatch):
@@ -165,7 +168,7 @@ def test_a_covariance_that_cannot_be_factorised_is_gone_back_from(monkeypatch):
 
     monkeypatch.setattr(mcem.MCEM, "step", stumbling)
     data = waves(20, 0)
-    trained = train("rbf", *started(data), data, 40, seeded(), InferenceSettings(look_every=10))
+    trained = train(*started(data), data, 40, seeded(), InferenceSettings(look_every=10))
     assert (trained.num_rollbacks, trained.num_iterations) == (1, 40)
     assert count == 45, "only the steps since the last look are repeated"
 
@@ -173,7 +176,7 @@ def test_a_covariance_that_cannot_be_factorised_is_gone_back_from(monkeypatch):
 def test_without_trouble_looking_changes_nothing():
     data = waves(30, 0)
     ends = [
-        train("rbf", *started(data), data, 30, seeded(), InferenceSettings(look_every=look)).chain.position
+        train(*started(data), data, 30, seeded(), InferenceSettings(look_every=look)).chain.position
         for look in (1, 7, 100)
     ]
     assert torch.equal(ends[0], ends[1]) and torch.equal(ends[0], ends[2])
@@ -182,19 +185,21 @@ def test_without_trouble_looking_changes_nothing():
 def test_training_stops_when_held_out_data_say_that_it_is_enough():
     data = waves(200, 0)
     settings = InferenceSettings(step_size=0.03, learning_rate=0.03, patience=3, look_every=25)
-    trained = train("matern52", *started(data, 1), data, 3000, seeded(), settings)
+    trained = train(*started(data, 1, "matern52"), data, 3000, seeded(), settings)
     assert 75 < trained.num_iterations < 1500
     assert trained.num_iterations % 25 == 0
     # It stopped late enough: as good as knowing function and noise, up to what 200 observations leave unknown.
-    pool, *_ = training.sample_pool("matern52", trained.model, trained.chain, data, 20, 5, seeded(), trained.settings)
+    pool, *_ = training.sample_pool(
+        factorise_all(trained.model), trained.chain, data, 20, 5, seeded(), trained.settings
+    )
     best = 2 * (-math.log(NOISE) - 0.5 * math.log(2 * math.pi * math.e))
-    found = predictive_log_likelihood("matern52", trained.model, pool, waves(400, 1), seeded())
+    found = predictive_log_likelihood(factorise_all(trained.model), pool, waves(400, 1), seeded())
     assert best - 0.25 < found < best + 0.2
     # Without patience, or with too little data to judge by, it goes on to the end.
     for rows, patience in ((200, None), (50, 1)):
         few = Data(data.x[:rows], data.y[:rows])
         settings = InferenceSettings(patience=patience, look_every=5, step_size=0.03)
-        assert train("rbf", *started(few, 1), few, 30, seeded(), settings).num_iterations == 30
+        assert train(*started(few, 1), few, 30, seeded(), settings).num_iterations == 30
 
 
 def test_held_out_rows_are_not_trained_on():
@@ -215,15 +220,15 @@ def test_sampling_that_diverges_begins_anew_with_smaller_steps(num_layers, gibbs
     model, chain = started(data, num_layers)
     # A preconditioner far too large for the curvature: unstable until the step has been halved a few times.
     wild = chain._replace(square=torch.full_like(chain.square, 1e-2))
-    settings = InferenceSettings(gibbs_every=gibbs_every, step_size=1.0)
-    pool, last, step_size = training.sample_pool("rbf", model, wild, data, 10, 20, seeded(), settings)
+    settings, factorised = InferenceSettings(gibbs_every=gibbs_every, step_size=1.0), factorise_all(model)
+    pool, last, step_size = training.sample_pool(factorised, wild, data, 10, 20, seeded(), settings)
     assert training.is_plausible(pool) and torch.equal(pool[-1], last.position)
     assert step_size in [0.5**halvings for halvings in range(1, training.MAX_ROLLBACKS + 1)]
     with pytest.raises(
         TrainingError, match="sampling the posterior diverged 6 times, the last time with the step size"
     ):
         training.sample_pool(
-            "rbf", model, wild, data, 10, 20, seeded(), InferenceSettings(gibbs_every=gibbs_every, step_size=1e3)
+            factorised, wild, data, 10, 20, seeded(), InferenceSettings(gibbs_every=gibbs_every, step_size=1e3)
         )
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.special
 
-MATERN_ORDER = {"matern12": 0.5, "matern32": 1.5, "matern52": 2.5}
+MATERN_ORDER = {"matern12": 0.5, "matern32": 1.5, "matern52": 2.5, "matern72": 3.5}
 JITTER = 1e-6  # relative to the kernel's variance, on the inducing outputs' covariance
 
 

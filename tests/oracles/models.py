@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from gym_dgpmpc.gp.deep_gp import DeepGP
+from gym_dgpmpc.gp.kernels import find_kernel
 from gym_dgpmpc.gp.layer import Layer
 from tests.oracles.gaussian_process import DenseLayer
 
@@ -17,14 +18,21 @@ def normal(generator: torch.Generator, *shape: int) -> Tensor:
 
 
 def make_model(
-    num_layers: int, input_size: int, num_targets: int, num_inducing: int, generator: torch.Generator
+    num_layers: int,
+    input_size: int,
+    num_targets: int,
+    num_inducing: int,
+    generator: torch.Generator,
+    kernel: str = "rbf",
 ) -> DeepGP:
     """Random inducing inputs, unequal lengthscales and variances; an inner layer that bends its input noticeably."""
 
     def layer(variance: float) -> Layer:
         lengthscale = 0.8 + torch.rand(input_size, generator=generator, dtype=torch.float64)
         inducing_inputs = 1.5 * normal(generator, num_inducing, input_size)
-        return Layer(inducing_inputs, lengthscale.log(), torch.tensor(variance, dtype=torch.float64).log())
+        return Layer(
+            find_kernel(kernel), inducing_inputs, lengthscale.log(), torch.tensor(variance, dtype=torch.float64).log()
+        )
 
     inner = [layer(0.15) for _ in range(num_layers - 1)]
     noise = 0.1 + 0.2 * torch.rand(num_targets, generator=generator, dtype=torch.float64)

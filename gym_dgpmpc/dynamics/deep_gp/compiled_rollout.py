@@ -2,14 +2,16 @@
 
 `PathwiseSampler` evaluates its functions with PyTorch, one step of a plan at a time; what is here takes the same
 functions through all steps at once, several times faster on a CPU and equal to it up to single-precision rounding.
+The compiled code has kernels of its own, which it is asked for by name; one that it does not have is left to PyTorch.
 """
 
 import ctypes
 import os
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -18,7 +20,7 @@ from torch.nn.functional import pad
 
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp import compiler
-from gym_dgpmpc.gp.kernels import KERNELS, Kernel, argument_scale
+from gym_dgpmpc.gp.kernels import Kernel
 
 _Floats = ctypes.POINTER(ctypes.c_float)
 _Integers = ctypes.POINTER(ctypes.c_int64)
@@ -29,9 +31,10 @@ AS_IS, SINE, COSINE, ACTION, FORWARDS, LEFTWARDS = range(6)
 class PathwiseLayer(NamedTuple):
     """One layer's functions, ready for a rollout: two products in, two out, in the rollout's precision."""
 
+    kernel: Kernel
     inverse_lengthscale: Float[Tensor, "D"]
     centres: Float[Tensor, "D M"]  # from x to the kernel's argument, with ...
-    offsets: Float[Tensor, "M"]  # ... and the factor of |x|^2, which is `argument_scale`
+    offsets: Float[Tensor, "M"]  # ... and the factor of |x|^2, which is the kernel's `argument_scale`
     frequencies: Float[Tensor, "D F"]  # from x to the features' phases, in turns
     phases: Float[Tensor, "F"]
     kernel_out: Float[Tensor, "T P O M"]  # sigma^2 alpha; T = H with refresh="step", else 1
@@ -40,6 +43,8 @@ class PathwiseLayer(NamedTuple):
 
 class _Layer(ctypes.Structure):
     _fields_ = (
+        ("kernel", ctypes.c_int64),
+        ("argument_scale", ctypes.c_float),
         ("outputs", ctypes.c_int64),
         ("inverse_lengthscale", _Floats),
         ("centres", _Floats),
@@ -63,8 +68,6 @@ class _Task(ctypes.Structure):
         ("num_inducing", ctypes.c_int64),
         ("num_features", ctypes.c_int64),
         ("num_functions", ctypes.c_int64),
-        ("kernel", ctypes.c_int64),
-        ("argument_scale", ctypes.c_float),
         ("input_kind", _Integers),
         ("input_source", _Integers),
         ("input_mean", _Floats),
@@ -82,24 +85,31 @@ class _Task(ctypes.Structure):
     )
 
 
-def is_available() -> bool:
-    """Whether there is compiled code for this machine; builds it at the first call, which takes seconds."""
-    return _library() is not None
+def is_available(kernel: Kernel | None = None) -> bool:
+    """Whether there is compiled code for this machine, and this kernel; builds it at the first call: some seconds.
+
+    Warns once if there is, but without the kernel.
+    """
+    if _library() is None:
+        return False
+    if kernel is None or _kernel_number(kernel) is not None:
+        return True
+    _warn_of_unknown_kernel(kernel.name)
+    return False
 
 
 class CompiledRollout:
     """All trajectories of one draw.
 
     Args:
-        kernel: of every layer.
         layers: the functions, float32 on the CPU.
         coordinates: raw states to standardised coordinates and back, float32.
 
     Raises:
-        RuntimeError: there is no compiled code; see `is_available`.
+        RuntimeError: there is no compiled code, or not for a layer's kernel; see `is_available`.
     """
 
-    def __init__(self, kernel: Kernel, layers: Sequence[PathwiseLayer], coordinates: Coordinates):
+    def __init__(self, layers: Sequence[PathwiseLayer], coordinates: Coordinates):
         library = _library()
         if library is None:
             raise RuntimeError("there is no compiled code on this machine: ask is_available first")
@@ -126,8 +136,6 @@ class CompiledRollout:
             num_inducing=_rounded_up(first.kernel_out.shape[-1], units),
             num_features=_rounded_up(first.feature_out.shape[-1], units),
             num_functions=first.kernel_out.shape[0],
-            kernel=KERNELS.index(kernel),
-            argument_scale=argument_scale(kernel),
             input_kind=self._integers(torch.tensor([kind for kind, _ in inputs])),
             input_source=self._integers(torch.tensor([source for _, source in inputs])),
             input_mean=self._floats(coordinates.input_mean),
@@ -191,8 +199,12 @@ class CompiledRollout:
 
     def _packed(self, layer: PathwiseLayer, units: int) -> _Layer:
         """A layer in the layout of the compiled code, M and F padded to whole blocks of functions that are zero."""
-        padded = _padded(layer, units)
+        number, padded = _kernel_number(layer.kernel), _padded(layer, units)
+        if number is None:
+            raise RuntimeError(f"the compiled code has no kernel {layer.kernel.name!r}: ask is_available first")
         return _Layer(
+            number,
+            layer.kernel.argument_scale,
             padded.kernel_out.shape[2],
             self._floats(padded.inverse_lengthscale),
             self._floats(_blocks(padded.centres, units)),
@@ -217,9 +229,26 @@ def _library() -> ctypes.CDLL | None:
     library = compiler.load("rollout")
     if library is not None:
         library.rollout.argtypes = (ctypes.POINTER(_Task), *(ctypes.c_int64,) * 3)
-        for function in (library.rollout, library.units, library.points):
+        library.kernel_number.argtypes = (ctypes.c_char_p,)
+        for function in (library.rollout, library.units, library.points, library.kernel_number):
             function.restype = ctypes.c_int64
     return library
+
+
+def _kernel_number(kernel: Kernel) -> int | None:
+    """What the compiled code calls this kernel; None if it has none of that name."""
+    library = _library()
+    number = -1 if library is None else int(library.kernel_number(kernel.name.encode()))
+    return None if number < 0 else number
+
+
+@cache
+def _warn_of_unknown_kernel(name: str) -> None:
+    warnings.warn(
+        f"plans are made without compiled code, several times slower, because it has no kernel {name!r}: add it to "
+        "dynamics/deep_gp/native/rollout.cpp; compile=False leaves out this warning",
+        stacklevel=2,
+    )
 
 
 @cache
@@ -251,7 +280,8 @@ def _padded(layer: PathwiseLayer, units: int) -> PathwiseLayer:
         "phases": pad_features,
         "feature_out": pad_features,
     }
-    return layer._replace(**{name: pad(getattr(layer, name), (0, size)) for name, size in padding.items()})
+    padded: dict[str, Any] = {name: pad(getattr(layer, name), (0, size)) for name, size in padding.items()}
+    return layer._replace(**padded)
 
 
 def _blocks(weights: Float[Tensor, "D n"], units: int) -> Float[Tensor, "blocks D units"]:

@@ -19,9 +19,8 @@ from torch import Tensor
 
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp.compiled_rollout import CompiledRollout, PathwiseLayer
-from gym_dgpmpc.gp.deep_gp import DeepGP
+from gym_dgpmpc.gp.deep_gp import Factorised
 from gym_dgpmpc.gp.features import draw_features
-from gym_dgpmpc.gp.kernels import Kernel, argument_scale, correlation_
 from gym_dgpmpc.gp.layer import Layer, conditional, joint_conditional
 from gym_dgpmpc.gp.linalg import JITTER, cholesky
 
@@ -32,11 +31,9 @@ REFRESHES: tuple[Refresh, ...] = get_args(Refresh)
 
 
 class Posterior(NamedTuple):
-    """What a draw is made from: hyperparameters, factors L_z, and one whitened sample per particle, per layer."""
+    """What a draw is made from: hyperparameters with factors L_z, and one whitened sample per particle, per layer."""
 
-    kernel: Kernel
-    model: DeepGP
-    factors: list[Float[Tensor, "M M"]]
+    factorised: Factorised
     whitened: list[Float[Tensor, "P M O"]]
 
 
@@ -53,29 +50,28 @@ class ConditionalSampler:
     def __call__(
         self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
     ) -> Float[Tensor, "P K S"]:
-        kernel, model, factors, whitened = self._posterior
+        (model, factors), whitened = self._posterior
         x = self._coordinates.encode(observation, action).to(factors[0].dtype)
         # Jointly drawn points share a covariance, which one that is not finite would make useless for all.
         lost = ~x.isfinite().all(-1, keepdim=True)
         x = x.masked_fill(lost, 0.0)
         last = len(factors) - 1
         for index, (layer, factor, v) in enumerate(zip(model.layers, factors, whitened, strict=True)):
-            value = self._sample_layer(kernel, layer, factor, v, x)
+            value = self._sample_layer(layer, factor, v, x)
             x = value if index == last else x + value
         return self._coordinates.decode(observation, x).masked_fill(lost, math.nan)
 
-    def _sample_layer(self, kernel: Kernel, layer: Layer, factor: Tensor, v: Tensor, x: Tensor) -> Tensor:
+    def _sample_layer(self, layer: Layer, factor: Tensor, v: Tensor, x: Tensor) -> Tensor:
         shape = (*x.shape[:-1], v.shape[-1])
         noise = torch.randn(shape, generator=self._generator, dtype=x.dtype, device=x.device)
         if not self._joint:
-            mean, variance = conditional(kernel, layer, factor, v, x)
+            mean, variance = conditional(layer, factor, v, x)
             return mean + variance.sqrt().unsqueeze(-1) * noise
-        mean, covariance = joint_conditional(kernel, layer, factor, v, x)
+        mean, covariance = joint_conditional(layer, factor, v, x)
         return mean + cholesky(covariance, layer.variance) @ noise
 
 
 def _draw_layer(
-    kernel: Kernel,
     layer: Layer,
     factor: Tensor,
     whitened: Tensor,
@@ -93,7 +89,7 @@ def _draw_layer(
     num_inducing, input_size = layer.inducing_inputs.shape
     num_particles, _, outputs = whitened.shape
     scaled = layer.inducing_inputs / layer.lengthscale
-    features = draw_features(kernel, num_features, input_size, generator, dtype=scaled.dtype)
+    features = draw_features(layer.kernel, num_features, input_size, generator, dtype=scaled.dtype)
     columns = num_functions * num_particles * outputs
     # Normals are drawn in single precision, which is six times faster and ample for random numbers.
     normals = torch.randn(num_features + num_inducing, columns, generator=generator, device=scaled.device)
@@ -109,8 +105,9 @@ def _draw_layer(
     def per_function(matrix: Float[Tensor, "n columns"]) -> Float[Tensor, "T P O n"]:
         return matrix.to(dtype).mT.contiguous().unflatten(0, (num_functions, num_particles, outputs))
 
-    scale = argument_scale(kernel)
+    scale = layer.kernel.argument_scale
     return PathwiseLayer(
+        layer.kernel,
         (1.0 / layer.lengthscale).to(dtype),
         (-2.0 * scale * scaled.mT).to(dtype),
         (scale * scaled.square().sum(-1)).to(dtype),
@@ -144,11 +141,11 @@ class PathwiseSampler:
         dtype: torch.dtype,
         generator: torch.Generator,
     ):
-        kernel, model, factors, whitened = posterior
+        (model, factors), whitened = posterior
         num_functions = horizon if refresh == "step" else 1
-        self.kernel, self.coordinates, self._by_step = kernel, coordinates, refresh == "step"
+        self.coordinates, self._by_step = coordinates, refresh == "step"
         self.layers = [
-            _draw_layer(kernel, layer, factor, v, num_functions, num_features, dtype, generator)
+            _draw_layer(layer, factor, v, num_functions, num_features, dtype, generator)
             for layer, factor, v in zip(model.layers, factors, whitened, strict=True)
         ]
         self._buffers: _Buffers | None = None
@@ -168,10 +165,9 @@ class PathwiseSampler:
     @cached_property
     def _in_weights(self) -> list[tuple[Tensor, Tensor]]:
         """Of each layer, from (x, |x|^2, 1) to the kernel's argument "D+2 M" and to the features' phases "D+2 F"."""
-        scale = argument_scale(self.kernel)
         weights = []
         for layer in self.layers:
-            square = torch.full_like(layer.offsets, scale)
+            square = torch.full_like(layer.offsets, layer.kernel.argument_scale)
             distance = torch.cat([layer.centres, torch.stack([square, layer.offsets])])
             turns = torch.cat([layer.frequencies, torch.stack([torch.zeros_like(layer.phases), layer.phases])])
             weights.append((distance, 2 * math.pi * turns))
@@ -193,7 +189,7 @@ class PathwiseSampler:
             points = augmented[own].flatten(0, 1)
             torch.mm(points, weights[0], out=correlations.view(len(points), -1))
             torch.mm(points, weights[1], out=waves.view(len(points), -1))
-            correlation_(self.kernel, correlations, decay)
+            layer.kernel.correlation_(correlations, decay)
             torch.bmm(waves.cos_(), feature_out[own], out=out[own])
             out[own].baddbmm_(correlations, kernel_out[own])
         return out
@@ -216,7 +212,7 @@ class CompiledPathwiseSampler(PathwiseSampler):
         generator: torch.Generator,
     ):
         super().__init__(posterior, coordinates, horizon, num_features, refresh, torch.float32, generator)
-        self._rollout = CompiledRollout(self.kernel, self.layers, coordinates)
+        self._rollout = CompiledRollout(self.layers, coordinates)
 
     def trajectories(
         self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]

@@ -1,14 +1,15 @@
 """The paper's dynamics model: a deep Gaussian process over transitions, sampled by SG-HMC.
 
 Prepares data for `inference/`, keeps what it returns (hyperparameters, chain, pool of posterior samples), and makes
-the draws of `deep_gp_draws.py` from the pool. The agent calls `fit` at an episode's start, `resample` after each
+the draws of `draws.py` from the pool. The agent calls `fit` at an episode's start, `resample` after each
 control step and `draw` for each plan.
 """
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp import compiled_rollout
 from gym_dgpmpc.dynamics.deep_gp.draws import (
@@ -32,18 +34,18 @@ from gym_dgpmpc.dynamics.deep_gp.start import initial_model, relocate, restandar
 from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
 from gym_dgpmpc.errors import FactorisationError
-from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
-from gym_dgpmpc.gp.kernels import Kernel, check_kernel
+from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all
+from gym_dgpmpc.gp.kernels import Kernel, find_kernel
 from gym_dgpmpc.inference import mcem, sghmc, training
 from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
-from gym_dgpmpc.inference.mcem import Data, InferenceSettings
+from gym_dgpmpc.inference.mcem import InferenceSettings
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
 
 class _Fitted(NamedTuple):
     """What a fit leaves behind, and a `resample` moves on."""
 
-    model: DeepGP
+    factorised: Factorised  # of which a saved state has the model alone
     normalisers: tuple[Normaliser, Normaliser]
     chain: sghmc.SGHMCState
     pool: Tensor  # "num_samples V", a ring
@@ -77,28 +79,39 @@ class DeepGPDynamics(Learner[_Fitted]):
         action_size: A.
         observation_spec: how to read the observation.
         num_layers: L, at least 1.
-        kernel: of every layer, with one lengthscale per input dimension.
+        kernel: of every layer, a name in `KERNELS`, with one lengthscale per input dimension.
         num_inducing: M, inducing points per layer.
-        draw: "pathwise", "joint" or "marginal"; see `deep_gp_draws`.
+        draw: "pathwise", "joint" or "marginal"; see `draws.py`.
         refresh: for "pathwise": a new function per particle at each "step" of a plan, or one for the whole "plan".
         num_features: F, random features of a pathwise draw; its prior covariance errs by F^-1/2.
-        first_iterations: training iterations (one SG-HMC and one Adam step each) of the first fit.
-        iterations: training iterations of each later fit.
+        first_training_iterations: training iterations (one SG-HMC and one Adam step each) of the first fit.
+        training_iterations: training iterations of each later fit.
         num_samples: size of the pool of posterior samples.
         sample_spacing: SG-HMC steps between two samples of the pool.
         resample_steps: SG-HMC steps of one `resample`; 0 leaves the posterior as it is within an episode.
         resample_samples: samples of the pool that one `resample` replaces, if the last layer is drawn exactly; at
             least 1 (``resample_steps=0`` turns re-sampling off).
         relocate: move the inducing inputs to the grown data's cluster centres before each later fit.
-        inference: settings of the sampler and the optimiser.
         compile: roll pathwise draws out in compiled code, several times faster; where there is no compiler, or for
             another precision or device, PyTorch does it.
         dtype: precision of rollouts; training and every factorisation are in float64.
         device: where tensors live.
+        **inference: the settings of `InferenceSettings`, each as a keyword argument of its own.
+
+    Attributes:
+        draw_kind: the setting ``draw``; `draw` is the method.
 
     Raises:
+        TypeError: there is no such setting.
         ValueError: a setting is out of its range.
     """
+
+    composed_of: ClassVar[tuple[type, ...]] = (InferenceSettings,)
+    """Classes whose settings the constructor takes as keyword arguments too."""
+    largest: ClassVar[Mapping[str, int]] = MappingProxyType({"num_layers": 100, "num_features": 10**5})
+    """What a file may claim; see `settings.settings_of`."""
+    unsaved: ClassVar[tuple[str, ...]] = ("compile",)
+    """Settings that depend on the machine, so that no file holds them."""
 
     def __init__(
         self,
@@ -112,24 +125,24 @@ class DeepGPDynamics(Learner[_Fitted]):
         draw: Draw = "pathwise",
         refresh: Refresh = "step",
         num_features: int = 128,
-        first_iterations: int = 4000,
-        iterations: int = 1000,
+        first_training_iterations: int = 4000,
+        training_iterations: int = 1000,
         num_samples: int = 100,
         sample_spacing: int = 10,
         resample_steps: int = 10,
         resample_samples: int = 5,
         relocate: bool = True,
-        inference: InferenceSettings | None = None,
         compile: bool = True,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
+        **inference: Any,
     ):
         check_counts(
             num_layers=num_layers,
             num_inducing=num_inducing,
             num_features=num_features,
-            first_iterations=first_iterations,
-            iterations=iterations,
+            first_training_iterations=first_training_iterations,
+            training_iterations=training_iterations,
             num_samples=num_samples,
             sample_spacing=sample_spacing,
             resample_samples=resample_samples,
@@ -141,15 +154,14 @@ class DeepGPDynamics(Learner[_Fitted]):
         if refresh not in REFRESHES:
             raise ValueError(f"unknown refresh {refresh!r}: expected one of {', '.join(REFRESHES)}")
         super().__init__(observation_size, action_size, observation_spec, dtype, device)
-        self.kernel: Kernel = check_kernel(kernel)
+        self.kernel: Kernel = find_kernel(kernel)
         self.num_layers, self.num_inducing, self.num_features = num_layers, num_inducing, num_features
         self.draw_kind, self.refresh = draw, refresh
-        self.first_iterations, self.iterations = first_iterations, iterations
+        self.first_training_iterations, self.training_iterations = first_training_iterations, training_iterations
         self.num_samples, self.sample_spacing, self.resample_steps = num_samples, sample_spacing, resample_steps
         self.relocate, self.resample_samples = relocate, min(resample_samples, num_samples)
-        self.inference = inference or InferenceSettings()
+        self.inference = InferenceSettings(**inference)
         self.compile = compile and dtype == torch.float32 and self.device.type == "cpu"
-        self._factors: list[Tensor] = []  # L_z of every layer; derived from the hyperparameters, so not saved
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """Train on all transitions: moving-window MCEM, then a fresh pool of posterior samples.
@@ -162,20 +174,18 @@ class DeepGPDynamics(Learner[_Fitted]):
         """
         normalisers, standardised = self._standardised(data)
         if self._fitted is None:
-            iterations = self.first_iterations
-            model = initial_model(standardised, self.num_layers, self.num_inducing, generator)
+            iterations = self.first_training_iterations
+            model = initial_model(self.kernel, standardised, self.num_layers, self.num_inducing, generator)
             whitened = standardised.x.new_zeros(model.num_whitened())
         else:
-            iterations, last = self.iterations, self._fitted
-            model, whitened = restandardise(last.model, last.chain.position, last.normalisers, normalisers)
+            iterations, last = self.training_iterations, self._fitted
+            model, whitened = restandardise(last.factorised.model, last.chain.position, last.normalisers, normalisers)
             if self.relocate:
-                model, whitened = relocate(self.kernel, model, whitened, standardised, generator)
-        trained = training.train(
-            self.kernel, model, sghmc.init(whitened), standardised, iterations, generator, self.inference
-        )
+                model, whitened = relocate(model, whitened, standardised, generator)
+        trained = training.train(model, sghmc.init(whitened), standardised, iterations, generator, self.inference)
+        factorised = factorise_all(trained.model)
         sampled = training.sample_pool(
-            self.kernel,
-            trained.model,
+            factorised,
             trained.chain,
             standardised,
             self.num_samples,
@@ -183,8 +193,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             generator,
             trained.settings,
         )
-        self._fitted = _Fitted(trained.model, normalisers, sampled.chain, sampled.pool, 0, sampled.step_size)
-        self._factors = factorise_all(self.kernel, trained.model)
+        self._fitted = _Fitted(factorised, normalisers, sampled.chain, sampled.pool, 0, sampled.step_size)
         counts = {"iterations": float(trained.num_iterations), "rollbacks": float(trained.num_rollbacks)}
         return {"negative_log_joint": trained.negative_log_joint} | counts | self._diagnostics(self._fitted)
 
@@ -219,17 +228,16 @@ class DeepGPDynamics(Learner[_Fitted]):
         self, fitted: _Fitted, data: Transitions, generator: torch.Generator
     ) -> tuple[sghmc.SGHMCState, Float[Tensor, "n V"]]:
         """The chain some steps on, and the samples for the pool, of which the last is where the chain then is."""
-        kernel, model, factors = self.kernel, fitted.model, self._factors
         standardised = _Standardised(self._encode, data, fitted.normalisers)
         settings = replace(self.inference, step_size=fitted.step_size)
         without_gibbs = replace(settings, gibbs_every=0)
         (chain,) = mcem.sample(
-            kernel, model, fitted.chain, standardised, 1, self.resample_steps, generator, without_gibbs, factors
+            fitted.factorised, fitted.chain, standardised, 1, self.resample_steps, generator, without_gibbs
         )
         if not settings.gibbs_every:
             return chain, chain.position.unsqueeze(0)
         newest = mcem.gibbs_positions(
-            kernel, model, factors, chain, standardised, self.resample_samples, generator, settings
+            fitted.factorised, chain, standardised, self.resample_samples, generator, settings
         )
         return chain._replace(position=newest[-1]), newest
 
@@ -242,12 +250,12 @@ class DeepGPDynamics(Learner[_Fitted]):
         fitted = self._require_fit("draw")
         order = torch.randperm(self.num_samples, generator=generator, device=self.device)
         picked = order.repeat(math.ceil(num_particles / self.num_samples))[:num_particles]
-        whitened = fitted.model.split(fitted.pool[picked])
-        posterior = Posterior(self.kernel, fitted.model, self._factors, whitened)
+        whitened = fitted.factorised.model.split(fitted.pool[picked])
+        posterior = Posterior(fitted.factorised, whitened)
         coordinates = Coordinates(self.encoder, *fitted.normalisers, self.dtype)
         if self.draw_kind == "pathwise":
             settings = posterior, coordinates, horizon, self.num_features, self.refresh
-            if self.compile and compiled_rollout.is_available():
+            if self.compile and compiled_rollout.is_available(self.kernel):
                 return CompiledPathwiseSampler(*settings, generator)
             return PathwiseSampler(*settings, self.dtype, generator)
         return ConditionalSampler(posterior, coordinates, generator, joint=self.draw_kind == "joint")
@@ -256,13 +264,13 @@ class DeepGPDynamics(Learner[_Fitted]):
         """Hyperparameters, normalisers, the chain and the whole pool of samples; empty before the first fit."""
         if self._fitted is None:
             return {}
-        fitted = self._fitted
+        fitted, model = self._fitted, self._fitted.factorised.model
         # The pool is the one tensor that changes in place, and a state should not change after it was taken.
-        state: StateDict = {"pool": fitted.pool.clone(), "oldest": fitted.oldest, "log_noise": fitted.model.log_noise}
+        state: StateDict = {"pool": fitted.pool.clone(), "oldest": fitted.oldest, "log_noise": model.log_noise}
         if fitted.step_size != self.inference.step_size:  # states of before it was kept do not have it either
             state["step_size"] = fitted.step_size
-        for index, layer in enumerate(fitted.model.layers):
-            state |= {f"layers.{index}.{name}": value for name, value in layer._asdict().items()}
+        for index, layer in enumerate(model.layers):
+            state |= {f"layers.{index}.{name}": value for name, value in layer.parameters().items()}
         state |= normalisers_state(*fitted.normalisers)
         return state | {f"chain.{name}": value for name, value in fitted.chain._asdict().items()}
 
@@ -273,7 +281,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             ValueError: an entry is missing or is not what these settings give it; the model stays as it was.
         """
         if not state:
-            self._fitted, self._factors = None, []
+            self._fitted = None
             return
         size, num_targets, device = self.encoder.input_size, self.encoder.target_size, self.device
         whitened = self.num_inducing * (size * (self.num_layers - 1) + num_targets)
@@ -281,7 +289,10 @@ class DeepGPDynamics(Learner[_Fitted]):
         def take(name: str, *shape: int) -> Tensor:
             return take_tensor(state, name, shape, device)
 
-        layers = (take_layer(state, f"layers.{i}.", self.num_inducing, size, device) for i in range(self.num_layers))
+        layers = (
+            take_layer(state, f"layers.{i}.", self.kernel, self.num_inducing, size, device)
+            for i in range(self.num_layers)
+        )
         model = DeepGP(tuple(layers), take("log_noise", num_targets))
         normalisers = (
             take_normaliser(state, "inputs", size, device),
@@ -296,18 +307,18 @@ class DeepGPDynamics(Learner[_Fitted]):
         step_size = state.get("step_size", self.inference.step_size)
         if not isinstance(step_size, float) or not 0.0 < step_size < math.inf:
             raise ValueError(f"dynamics state 'step_size': expected a positive number, received {step_size!r}")
-        self._factors = factorise_all(self.kernel, model)
-        self._fitted = _Fitted(model, normalisers, chain, pool, oldest, step_size)
+        self._fitted = _Fitted(factorise_all(model), normalisers, chain, pool, oldest, step_size)
 
     def _diagnostics(self, fitted: _Fitted) -> dict[str, float]:
         """Mixing of the kept samples (medians over coordinates), and the fitted noise and kernel scales."""
+        model = fitted.factorised.model
         metrics = {
             "effective_sample_size": float(effective_sample_size(fitted.pool).median()),
             "gradient_norm": float(fitted.chain.gradient.norm()),
-            "noise_std": float(fitted.model.noise_variance.sqrt().mean()),
+            "noise_std": float(model.noise_variance.sqrt().mean()),
         }
         if self.num_samples >= 4:
             metrics["r_hat"] = float(split_r_hat(fitted.pool).median())
-        for index, layer in enumerate(fitted.model.layers):
+        for index, layer in enumerate(model.layers):
             metrics[f"layer_{index + 1}_kernel_std"] = float(layer.variance.sqrt())
         return metrics

@@ -1,6 +1,6 @@
 """Where training starts: a deep Gaussian process initialised from data, or carried over to grown data.
 
-Used by `deep_gp.py` at the beginning of every fit.
+Used by `model.py` at the beginning of every fit.
 """
 
 import math
@@ -13,10 +13,10 @@ from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
 from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.gp.deep_gp import DeepGP
 from gym_dgpmpc.gp.kernels import Kernel
 from gym_dgpmpc.gp.layer import Layer, conditional, factorise
-from gym_dgpmpc.inference.mcem import Data
 
 MOST_CLUSTERED = 10_000
 """Of more rows than this a random subset is clustered, so that the cost does not grow with the data."""
@@ -25,7 +25,7 @@ INNER_VARIANCE = 0.01
 NOISE_VARIANCE = 0.05
 
 
-def initial_model(data: Data, num_layers: int, num_inducing: int, generator: torch.Generator) -> DeepGP:
+def initial_model(kernel: Kernel, data: Data, num_layers: int, num_inducing: int, generator: torch.Generator) -> DeepGP:
     """Hyperparameters before the first fit, for standardised data.
 
     Inducing inputs by k-means of the inputs, in every layer (the inner layers start near the identity); lengthscales
@@ -36,7 +36,7 @@ def initial_model(data: Data, num_layers: int, num_inducing: int, generator: tor
     log_lengthscale = data.x.new_full((size,), 0.5 * math.log(size))
 
     def layer(variance: float) -> Layer:
-        return Layer(centres.clone(), log_lengthscale.clone(), data.x.new_tensor(math.log(variance)))
+        return Layer(kernel, centres.clone(), log_lengthscale.clone(), data.x.new_tensor(math.log(variance)))
 
     layers = tuple(layer(INNER_VARIANCE) for _ in range(num_layers - 1))
     return DeepGP((*layers, layer(1.0)), data.y.new_full((data.y.shape[1],), math.log(NOISE_VARIANCE)))
@@ -82,12 +82,15 @@ def restandardise(
     stretch_out = old[1].std / new[1].std
     common = stretch_out.log().mean()
     layers = [
-        Layer(layer.inducing_inputs * stretch + shift, layer.log_lengthscale + stretch.log(), layer.log_variance)
+        layer._replace(
+            inducing_inputs=layer.inducing_inputs * stretch + shift,
+            log_lengthscale=layer.log_lengthscale + stretch.log(),
+        )
         for layer in model.layers
     ]
     layers[-1] = layers[-1]._replace(log_variance=layers[-1].log_variance + 2 * common)
-    parts = model.split(whitened)
-    scaled = [v * stretch for v in parts[:-1]] + [parts[-1] * (stretch_out / common.exp())]
+    *inner, last = model.split(whitened)
+    scaled = [v * stretch for v in inner] + [last * (stretch_out / common.exp())]
     return (
         DeepGP(tuple(layers), model.log_noise + 2 * stretch_out.log()),
         torch.cat([v.flatten() for v in scaled]),
@@ -95,21 +98,21 @@ def restandardise(
 
 
 def relocate(
-    kernel: Kernel, model: DeepGP, whitened: Float[Tensor, "V"], data: Data, generator: torch.Generator
+    model: DeepGP, whitened: Float[Tensor, "V"], data: Data, generator: torch.Generator
 ) -> tuple[DeepGP, Float[Tensor, "V"]]:
     """Move every layer's inducing inputs to where its inputs are now, keeping the function they encode.
 
     New centres come from k-means of the inputs propagated by the layers' means; the new inducing outputs are the old
     conditional mean there.
     """
-    layers, parts, x = [], [], _clustered(data.x, generator)
+    layers, outputs, x = [], [], _clustered(data.x, generator)
     last = len(model.layers) - 1
     for index, (layer, v) in enumerate(zip(model.layers, model.split(whitened), strict=True)):
-        factor = factorise(kernel, layer)
+        factor = factorise(layer)
         moved = layer._replace(inducing_inputs=cluster(x, layer.inducing_inputs.shape[0], generator))
-        mean, _ = conditional(kernel, layer, factor, v, moved.inducing_inputs)
-        parts.append(torch.linalg.solve_triangular(factorise(kernel, moved), mean, upper=False))
+        mean, _ = conditional(layer, factor, v, moved.inducing_inputs)
+        outputs.append(torch.linalg.solve_triangular(factorise(moved), mean, upper=False))
         layers.append(moved)
         if index != last:
-            x = x + conditional(kernel, layer, factor, v, x)[0]
-    return DeepGP(tuple(layers), model.log_noise), torch.cat([v.flatten() for v in parts])
+            x = x + conditional(layer, factor, v, x)[0]
+    return DeepGP(tuple(layers), model.log_noise), torch.cat([v.flatten() for v in outputs])

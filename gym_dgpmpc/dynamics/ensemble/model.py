@@ -1,7 +1,7 @@
 """The dynamics model of PETS: an ensemble of probabilistic networks, each trained on a resampling of the data.
 
 Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials using Probabilistic Dynamics Models". The
-networks are in `ensemble_network.py`, the draws in `ensemble_draws.py`.
+networks are in `network.py`, the draws in `draws.py`.
 """
 
 import math
@@ -61,11 +61,14 @@ class EnsembleDynamics(Learner[_Fitted]):
         learning_rate: of Adam.
         batch_size: transitions per member and gradient.
         num_epochs: passes over the data in one training.
-        draw: "TS1", "TSinf", "DS", "MM" or "expectation"; see `ensemble_draws`.
+        draw: "TS1", "TSinf", "DS", "MM" or "expectation"; see `draws.py`.
         half_precision: in rollouts, compute the layers between the first and the last in bfloat16: faster by a
             multiple on processors with instructions for it, and off by some 0.3 % of a prediction.
         dtype: precision of all else in rollouts; networks are trained in float32.
         device: where tensors live.
+
+    Attributes:
+        draw_kind: the setting ``draw``; `draw` is the method.
 
     Raises:
         ValueError: a setting is out of its range.

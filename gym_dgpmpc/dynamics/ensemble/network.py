@@ -1,7 +1,7 @@
 """An ensemble of probabilistic networks as pure functions of its parameters, all members in one batched product.
 
 Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials using Probabilistic Dynamics Models", with the
-initial values, bounds and losses of their published code. `ensemble.py` trains it and draws from it.
+initial values, bounds and losses of their published code. `model.py` trains it and draws from it.
 """
 
 from collections.abc import Sequence
@@ -33,18 +33,20 @@ class Ensemble(NamedTuple):
     def parameters(self) -> dict[str, Tensor]:
         """Every tensor by name."""
         layers = enumerate(zip(self.weights, self.biases, strict=True))
-        named = {f"layers.{i}.{name}": value for i, pair in layers for name, value in zip(_PARTS, pair, strict=True)}
+        named = {
+            f"layers.{i}.{name}": value for i, pair in layers for name, value in zip(_LAYER_FIELDS, pair, strict=True)
+        }
         return named | {"max_logvar": self.max_logvar, "min_logvar": self.min_logvar}
 
     @classmethod
     def from_parameters(cls, named: dict[str, Tensor]) -> "Ensemble":
         """The inverse of `parameters`."""
         count = sum(name.endswith(".weight") for name in named)
-        weights, biases = (tuple(named[f"layers.{i}.{name}"] for i in range(count)) for name in _PARTS)
+        weights, biases = (tuple(named[f"layers.{i}.{name}"] for i in range(count)) for name in _LAYER_FIELDS)
         return cls(weights, biases, named["max_logvar"], named["min_logvar"])
 
 
-_PARTS = ("weight", "bias")
+_LAYER_FIELDS = ("weight", "bias")
 
 
 def layer_sizes(
@@ -93,8 +95,8 @@ def predict(ensemble: Ensemble, x: Float[Tensor, "B n D"]) -> Prediction:
         x: standardised inputs, those of each member. Each layer computes in the precision of its weights.
     """
     if not torch.is_grad_enabled() and x.device.type == "cpu" and x.shape[1] > ROWS_AT_ONCE:
-        parts = [predict(ensemble, part) for part in x.split(ROWS_AT_ONCE, dim=1)]
-        return Prediction(*(torch.cat(values, dim=1) for values in zip(*parts, strict=True)))
+        predictions = [predict(ensemble, rows) for rows in x.split(ROWS_AT_ONCE, dim=1)]
+        return Prediction(*(torch.cat(values, dim=1) for values in zip(*predictions, strict=True)))
     *inner, last = zip(ensemble.weights, ensemble.biases, strict=True)
     # Where no gradient is recorded the activation overwrites its argument: memory traffic is what is left to save.
     in_place = not torch.is_grad_enabled()

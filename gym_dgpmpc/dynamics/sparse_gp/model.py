@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp.start import NOISE_VARIANCE, restandardise
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
@@ -21,12 +22,11 @@ from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.sparse_gp.moment_matching import MomentMatchingSampler
 from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
 from gym_dgpmpc.gp.deep_gp import DeepGP
-from gym_dgpmpc.gp.kernels import Kernel, check_kernel
+from gym_dgpmpc.gp.kernels import RBF, Kernel, find_kernel
 from gym_dgpmpc.gp.layer import Layer
 from gym_dgpmpc.gp.moments import Predictor
 from gym_dgpmpc.gp.sgpr import SparsePosterior, shrinkage, sparse_posterior, sparse_predict
 from gym_dgpmpc.inference.lbfgs import maximise_bound
-from gym_dgpmpc.inference.mcem import Data
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
 GPDraw = Literal["DS", "MM", "AMM"]
@@ -49,11 +49,11 @@ class SparseGPDynamics(Learner[_Fitted]):
         observation_size: S.
         action_size: A.
         observation_spec: how to read the observation.
-        kernel: with one lengthscale per input dimension.
+        kernel: a name in `KERNELS`, with one lengthscale per input dimension.
         num_inducing: M, inducing points; of fewer transitions, each is one.
         exact: make every transition an inducing point and keep it there, which is the exact Gaussian process up to the
             jitter. Cost grows with the cube of the number of transitions: for small data.
-        max_iterations: of the optimiser, in each training.
+        max_training_iterations: of the optimiser, in each training.
         draw: how particles move: "DS", each by its own draw from the Gaussian at its place; "MM", as DS, then the
             particles of a candidate are replaced by draws from their mean and variance; "AMM", a Gaussian per
             candidate through its exact moments (kernel "rbf", more particles than an observation has numbers).
@@ -62,6 +62,9 @@ class SparseGPDynamics(Learner[_Fitted]):
             ``exact``, each is one more inducing input); PETS does so between episodes only.
         dtype: precision of a rollout's states; the model itself computes in float64.
         device: where tensors live.
+
+    Attributes:
+        draw_kind: the setting ``draw``; `draw` is the method.
 
     Raises:
         ValueError: a setting is out of its range.
@@ -76,18 +79,18 @@ class SparseGPDynamics(Learner[_Fitted]):
         kernel: str = "rbf",
         num_inducing: int = 200,
         exact: bool = False,
-        max_iterations: int = 200,
+        max_training_iterations: int = 200,
         draw: GPDraw = "DS",
         add_noise: bool = False,
         update_within_episode: bool = False,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ):
-        check_counts(num_inducing=num_inducing, max_iterations=max_iterations)
+        check_counts(num_inducing=num_inducing, max_training_iterations=max_training_iterations)
         if draw not in GP_DRAWS:
             raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(GP_DRAWS)}")
-        self.kernel: Kernel = check_kernel(kernel)
-        if draw == "AMM" and self.kernel != "rbf":
+        self.kernel: Kernel = find_kernel(kernel)
+        if draw == "AMM" and not isinstance(self.kernel, RBF):
             raise ValueError(f"the draw AMM has closed forms for the kernel 'rbf' only, received {kernel!r}")
         if draw == "AMM" and observation_spec is not None and observation_spec.body_frame:
             raise ValueError(
@@ -95,7 +98,8 @@ class SparseGPDynamics(Learner[_Fitted]):
                 f"received body_frame={observation_spec.body_frame}; take the draw MM"
             )
         super().__init__(observation_size, action_size, observation_spec, dtype, device)
-        self.num_inducing, self.exact, self.max_iterations = num_inducing, exact, max_iterations
+        self.num_inducing, self.exact = num_inducing, exact
+        self.max_training_iterations = max_training_iterations
         self.draw_kind, self.add_noise, self.update_within_episode = draw, add_noise, update_within_episode
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
@@ -106,9 +110,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         """
         normalisers, standardised = self._standardised(data)
         start = self._start(standardised, normalisers, generator)
-        found = maximise_bound(
-            self.kernel, start, standardised, self.max_iterations, free_inducing_inputs=not self.exact
-        )
+        found = maximise_bound(start, standardised, self.max_training_iterations, free_inducing_inputs=not self.exact)
         self._condition(found.model, normalisers, standardised)
         return {
             "bound": found.bound,
@@ -146,7 +148,7 @@ class SparseGPDynamics(Learner[_Fitted]):
             return MomentMatchingSampler(predictor, self.encoder, *normalisers, noise, num_particles, generator)
 
         def predict(x: Tensor) -> Gaussian:
-            mean, variance = sparse_predict(self.kernel, model.layers[0], model.noise_variance, posterior, x.double())
+            mean, variance = sparse_predict(model.layers[0], model.noise_variance, posterior, x.double())
             return Gaussian(mean, variance + noise)
 
         coordinates = Coordinates(self.encoder, *normalisers, self.dtype)
@@ -157,7 +159,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         if self._fitted is None:
             return {}
         model, normalisers, posterior = self._fitted
-        state: StateDict = {**model.layers[0]._asdict(), "log_noise": model.log_noise}
+        state: StateDict = {**model.layers[0].parameters(), "log_noise": model.log_noise}
         state |= normalisers_state(*normalisers)
         return state | {f"posterior.{key}": value for key, value in posterior._asdict().items()}
 
@@ -175,7 +177,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         received = state.get("inducing_inputs")
         count = len(received) if isinstance(received, Tensor) and received.ndim == 2 else self.num_inducing
         count = count if self.exact else min(count, self.num_inducing)
-        layer = take_layer(state, "", count, sizes[0], device)
+        layer = take_layer(state, "", self.kernel, count, sizes[0], device)
         model = DeepGP((layer,), take_tensor(state, "log_noise", (sizes[1],), device))
         normalisers = (
             take_normaliser(state, "inputs", sizes[0], device),
@@ -192,7 +194,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         rows = torch.randperm(num_data, generator=generator, device=data.x.device)[: self.num_inducing]
         inducing = data.x if self.exact else data.x[rows]
         if self._fitted is None:
-            layer = Layer(inducing, data.x.new_full((size,), 0.5 * math.log(size)), data.x.new_zeros(()))
+            layer = Layer(self.kernel, inducing, data.x.new_full((size,), 0.5 * math.log(size)), data.x.new_zeros(()))
             return DeepGP((layer,), data.y.new_full((data.y.shape[1],), math.log(NOISE_VARIANCE)))
         last = self._fitted
         outputs = data.y.new_zeros(last.model.num_whitened())  # of the inducing outputs nothing is carried over
@@ -200,7 +202,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         return model._replace(layers=(model.layers[0]._replace(inducing_inputs=inducing),))
 
     def _condition(self, model: DeepGP, normalisers: tuple[Normaliser, Normaliser], data: Data) -> None:
-        posterior = sparse_posterior(self.kernel, model.layers[0], model.noise_variance, *data)
+        posterior = sparse_posterior(model.layers[0], model.noise_variance, *data)
         self._fitted = _Fitted(model, normalisers, posterior)
 
 

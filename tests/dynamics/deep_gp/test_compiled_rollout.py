@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp.draws import CompiledPathwiseSampler, PathwiseSampler, Posterior
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics, compiled_rollout
 from gym_dgpmpc.gp.deep_gp import factorise_all
-from gym_dgpmpc.gp.kernels import KERNELS
+from gym_dgpmpc.gp.kernels import KERNELS, RBF
 from gym_dgpmpc.planning.rollout import rollout
 from gym_dgpmpc.types import ObservationSpec, TrajectorySampler, Transitions
 from tests.oracles.models import make_model, normal, seeded
@@ -44,8 +45,11 @@ class Draw:
             for size in (encoder.input_size, encoder.target_size)
         )
         model = make_model(num_layers, encoder.input_size, encoder.target_size, num_inducing, generator)
+        names = kernel if isinstance(kernel, tuple) else (kernel,) * num_layers
+        layers = zip(model.layers, names, strict=True)
+        model = model._replace(layers=tuple(layer._replace(kernel=KERNELS[name]) for layer, name in layers))
         whitened = model.split(normal(generator, PARTICLES, model.num_whitened()))
-        posterior = Posterior(kernel, model, factorise_all(kernel, model), whitened)
+        posterior = Posterior(factorise_all(model), whitened)
 
         def sampler(dtype):
             coordinates = Coordinates(encoder, inputs, targets, dtype)
@@ -95,6 +99,50 @@ def test_far_from_the_inducing_inputs_and_on_them(kernel):
         compiled, by_torch = errors(draw, draw.actions(5))
         # cos of a phase phi errs by the rounding of phi.
         assert compiled < max(10 * by_torch, 1e-6 * observation.abs().max(), 1e-5)
+
+
+def test_every_layer_may_have_a_kernel_of_its_own():
+    kernels = ("matern12", "rbf", "matern72")
+    draw = Draw(kernels, 3)
+    compiled, by_torch = errors(draw, draw.actions(40))
+    assert compiled < max(10 * by_torch, 1e-5)
+    swapped = Draw(kernels[::-1], 3)
+    actions = draw.actions(3)
+    first, second = (each.compiled.trajectories(draw.observation, actions)[1] for each in (draw, swapped))
+    assert (first - second).abs().max() > 0.01, "the order of the kernels plays no part"
+
+
+class Own(RBF):
+    """A kernel of somebody else's, which the compiled code has not heard of."""
+
+    name = "own"
+
+
+def test_a_kernel_that_the_compiled_code_does_not_have_is_left_to_pytorch(monkeypatch):
+    """With one warning, and none where compiled code is not wanted; the plans are the same."""
+    monkeypatch.setitem(KERNELS, "own", Own())
+    compiled_rollout._warn_of_unknown_kernel.cache_clear()
+    observation = normal(seeded(), 10, 3).float()
+    worlds = []
+    for kernel, compile in (("own", True), ("rbf", False), ("own", False), ("own", True)):
+        model = DeepGPDynamics(
+            3, 2, kernel=kernel, num_inducing=5, first_training_iterations=2, num_samples=2, compile=compile
+        )
+        model.fit(Transitions(observation, observation[:, :2], observation), seeded())
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            worlds.append(model.draw(2, 3, seeded()))
+        said = [str(warning.message) for warning in caught]
+        assert len(said) == (len(worlds) == 1) and all("no kernel 'own'" in text for text in said)
+        assert not isinstance(worlds[-1], TrajectorySampler)
+    states = [world(observation.expand(2, -1, -1).clone(), observation[:, :2], 0) for world in worlds]
+    assert all(torch.equal(states[0], other) for other in states[1:])
+
+
+def test_a_compiled_world_of_an_unknown_kernel_is_an_error(monkeypatch):
+    monkeypatch.setitem(KERNELS, "own", Own())
+    with pytest.raises(RuntimeError, match="no kernel 'own'"):
+        Draw("own", 1)
 
 
 def test_large_angles_keep_their_digits():
@@ -195,7 +243,14 @@ def test_the_model_draws_compiled_worlds_and_plans_alike_without(refresh):
     results = []
     for compile in (True, False):
         model = DeepGPDynamics(
-            3, 2, num_inducing=20, num_features=32, first_iterations=20, num_samples=5, refresh=refresh, compile=compile
+            3,
+            2,
+            num_inducing=20,
+            num_features=32,
+            first_training_iterations=20,
+            num_samples=5,
+            refresh=refresh,
+            compile=compile,
         )
         model.fit(data, seeded(1))
         world = model.draw(PARTICLES, HORIZON, seeded(2))
@@ -205,7 +260,7 @@ def test_the_model_draws_compiled_worlds_and_plans_alike_without(refresh):
 
 
 def test_double_precision_is_rolled_out_by_pytorch():
-    model = DeepGPDynamics(3, 2, num_inducing=5, first_iterations=2, num_samples=2, dtype=torch.float64)
+    model = DeepGPDynamics(3, 2, num_inducing=5, first_training_iterations=2, num_samples=2, dtype=torch.float64)
     observation = normal(seeded(), 10, 3).float()
     model.fit(Transitions(observation, observation[:, :2], observation), seeded())
     assert not isinstance(model.draw(2, 3, seeded()), TrajectorySampler)

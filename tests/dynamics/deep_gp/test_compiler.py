@@ -39,7 +39,7 @@ def fresh(monkeypatch, tmp_path):
 )
 def test_without_a_compiler_one_warning_and_the_same_worlds(monkeypatch, command, complaint):
     monkeypatch.setenv("CXX", command)
-    model = DeepGPDynamics(3, 2, num_inducing=5, first_iterations=2, num_samples=2)
+    model = DeepGPDynamics(3, 2, num_inducing=5, first_training_iterations=2, num_samples=2)
     observation = normal(seeded(), 10, 3).float()
     model.fit(Transitions(observation, observation[:, :2], observation), seeded())
     with pytest.warns(UserWarning, match=complaint):
@@ -53,7 +53,7 @@ def test_without_a_compiler_one_warning_and_the_same_worlds(monkeypatch, command
 
 def test_who_does_not_want_it_is_not_warned(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
-    model = DeepGPDynamics(3, 2, num_inducing=5, first_iterations=2, num_samples=2, compile=False)
+    model = DeepGPDynamics(3, 2, num_inducing=5, first_training_iterations=2, num_samples=2, compile=False)
     observation = normal(seeded(), 10, 3).float()
     model.fit(Transitions(observation, observation[:, :2], observation), seeded())
     with warnings.catch_warnings():
@@ -123,11 +123,14 @@ def test_memory_that_cannot_be_had_is_an_error(monkeypatch):
         def points(self):
             return 8
 
+        def kernel_number(self, name):
+            return 0
+
         def rollout(self, *_):
             return 1
 
     monkeypatch.setattr(compiled_rollout, "_library", functools.cache(Library))
-    model = DeepGPDynamics(3, 2, num_inducing=5, first_iterations=2, num_samples=2, compile=True)
+    model = DeepGPDynamics(3, 2, num_inducing=5, first_training_iterations=2, num_samples=2, compile=True)
     observation = normal(seeded(), 10, 3).float()
     model.fit(Transitions(observation, observation[:, :2], observation), seeded())
     world = model.draw(2, 3, seeded())

@@ -36,8 +36,8 @@ class World:
     def __init__(self, kernel, num_layers):
         generator = seeded(7)
         self.kernel = kernel
-        self.model = make_model(num_layers, 3, 2, NUM_INDUCING, generator)
-        self.factors = factorise_all(kernel, self.model)
+        self.model = make_model(num_layers, 3, 2, NUM_INDUCING, generator, kernel)
+        self.factorised = factorise_all(self.model)
         self.whitened = self.model.split(normal(generator, 2, self.model.num_whitened()))
         self.observation, self.action = normal(generator, NUM_POINTS, 2), normal(generator, NUM_POINTS, 1)
         # Two points close to each other, as candidates of a plan are.
@@ -46,7 +46,7 @@ class World:
 
     def posterior(self, particles_per_sample):
         whitened = [v.repeat_interleave(particles_per_sample, dim=0) for v in self.whitened]
-        return Posterior(self.kernel, self.model, self.factors, whitened)
+        return Posterior(self.factorised, whitened)
 
     def values(self, sampler, particles_per_sample, step=0, points=slice(None)):
         """f [2, particles, points, T] in standardised targets, through the sampler's raw units."""
@@ -186,7 +186,7 @@ def test_functions_pass_through_the_inducing_outputs(kernel, refresh):
     sampler = PathwiseSampler(world.posterior(3), COORDINATES, 2, 64, refresh, torch.float64, seeded())
     observation = raw[:, :2].expand(6, -1, -1).clone()
     target = TARGETS(sampler(observation, raw[:, 2:], 1) - observation)
-    u = (world.factors[0] @ world.whitened[0]).repeat_interleave(3, dim=0)
+    u = (world.factorised.factors[0] @ world.whitened[0]).repeat_interleave(3, dim=0)
     # The jitter leaves a standard deviation of sqrt(1e-6) sigma to each inducing output, and to its draw as much.
     assert (target - u).abs().max() < 6 * np.sqrt(2e-6 * float(world.model.layers[0].variance))
 

@@ -13,7 +13,7 @@ from tests.oracles import pendulum
 from tests.oracles.models import seeded
 
 TINY = {
-    "num_inducing": 8, "num_features": 16, "first_iterations": 3, "iterations": 2, "num_samples": 4,
+    "num_inducing": 8, "num_features": 16, "first_training_iterations": 3, "training_iterations": 2, "num_samples": 4,
     "sample_spacing": 1, "resample_steps": 2,
 }  # fmt: skip
 
@@ -112,8 +112,7 @@ def test_an_unfitted_model_says_so(verb):
 @pytest.mark.parametrize("gibbs_every", [20, 0])
 def test_resampling_replaces_the_oldest_rows_of_the_pool_and_nothing_else(gibbs_every):
     num = 3 if gibbs_every else 1  # SG-HMC alone gives one position
-    settings = InferenceSettings(gibbs_every=gibbs_every)
-    model, generator = fitted(num_samples=4, resample_samples=3, inference=settings), seeded(3)
+    model, generator = fitted(num_samples=4, resample_samples=3, gibbs_every=gibbs_every), seeded(3)
     before = {name: torch.as_tensor(value).clone() for name, value in model.state_dict().items()}
     pool, oldest = before["pool"], 0
     for count in range(1, 6):  # around the ring of four and further
@@ -230,13 +229,19 @@ def test_a_position_outside_the_ring_is_refused(oldest):
         ({"num_layers": 0}, "num_layers must be at least 1, got 0"),
         ({"num_inducing": 0}, "num_inducing must be at least 1"),
         ({"num_features": -1}, "num_features must be at least 1, got -1"),
-        ({"first_iterations": 0}, "first_iterations"),
-        ({"iterations": 0}, "iterations"),
+        ({"first_training_iterations": 0}, "first_training_iterations must be at least 1, got 0"),
+        ({"training_iterations": 0}, "training_iterations must be at least 1, got 0"),
         ({"num_samples": 0}, "num_samples"),
         ({"sample_spacing": 0}, "sample_spacing"),
         ({"resample_samples": 0}, "resample_samples must be at least 1, got 0"),
         ({"resample_samples": -3}, "resample_samples must be at least 1, got -3"),
         ({"resample_steps": -1}, "resample_steps must be at least 0, received -1"),
+        ({"batch_size": 0}, "batch_size must be at least 1, got 0"),
+        ({"patience": 0}, "patience must be at least 1, got 0"),
+        ({"step_size": 0.0}, "step_size must be positive and finite, received 0.0"),
+        ({"learning_rate": float("nan")}, "learning_rate must be positive and finite, received nan"),
+        ({"decay": 1.5}, r"decay must lie in \[0, 1\], received 1.5"),
+        ({"gibbs_every": -1}, "gibbs_every must be at least 0, received -1"),
         ({"draw": "thompson"}, "unknown draw 'thompson': expected one of pathwise, joint, marginal"),
         ({"refresh": "never"}, "unknown refresh 'never': expected one of step, plan"),
         ({"kernel": "cubic"}, "unknown kernel 'cubic': expected one of rbf"),
@@ -248,19 +253,27 @@ def test_settings_out_of_range_are_named(settings, message):
         DeepGPDynamics(2, 1, pendulum.SPEC, **settings)
 
 
+def test_settings_of_inference_are_settings_of_the_model():
+    given = {"step_size": 0.03, "decay": 0.1, "window_size": 7, "patience": 3, "look_every": 11}
+    assert tiny(**given).inference == InferenceSettings(**given)
+    assert tiny().inference == InferenceSettings()
+    with pytest.raises(TypeError, match="'stepsize'"):
+        tiny(stepsize=0.03)
+
+
 def test_a_training_that_diverges_leaves_the_model_as_it_was():
     model = fitted()
     before = predictions(model)
     model.inference = InferenceSettings(step_size=1e4, gibbs_every=0)
     with pytest.raises(TrainingError):
-        model.iterations = 50
+        model.training_iterations = 50
         model.fit(pendulum.simulate(40), seeded())
     assert torch.equal(predictions(model), before)
 
 
 @pytest.mark.parametrize("gibbs_every", [20, 0])
 def test_a_resampling_that_diverges_is_dropped(gibbs_every):
-    model = fitted(inference=InferenceSettings(gibbs_every=gibbs_every), resample_steps=50)
+    model = fitted(gibbs_every=gibbs_every, resample_steps=50)
     before, step_size = predictions(model), model._fitted.step_size
     model._fitted = model._fitted._replace(step_size=1e4)
     assert model.resample(pendulum.simulate(31), seeded()) == {"resamplings_dropped": 1.0}
@@ -272,7 +285,7 @@ def test_a_resampling_that_diverges_is_dropped(gibbs_every):
 
 def test_resampling_takes_the_steps_that_training_had_to_make_smaller():
     """Those asked for diverge each time, and the pool would stay as it is for a whole episode."""
-    settings = {"inference": InferenceSettings(step_size=8.0), "first_iterations": 300, "resample_steps": 10}
+    settings = {"step_size": 8.0, "first_training_iterations": 300, "resample_steps": 10}
     model = tiny(**settings)
     metrics = model.fit(pendulum.simulate(40), seeded())
     assert metrics["rollbacks"] >= 1
@@ -288,7 +301,7 @@ def test_resampling_takes_the_steps_that_training_had_to_make_smaller():
 
 def test_a_state_without_a_step_size_has_the_one_asked_for():
     """So do the states of earlier versions, and those of trainings that had no need of another."""
-    settings = {"inference": InferenceSettings(step_size=0.01)}
+    settings = {"step_size": 0.01}
     state = fitted(**settings).state_dict()
     assert "step_size" not in state
     model = tiny(**settings)
@@ -301,8 +314,7 @@ def test_a_state_without_a_step_size_has_the_one_asked_for():
 
 def test_resampling_encodes_the_rows_it_needs_and_no_others():
     """Its cost does not grow with the data: of 10,000 transitions it looks at a few minibatches."""
-    settings = InferenceSettings(batch_size=16, gibbs_rows=32)
-    model, seen = fitted(inference=settings), []
+    model, seen = fitted(batch_size=16, gibbs_rows=32), []
     encode = model._encode
     model._encode = lambda data: seen.append(len(data.action)) or encode(data)
     many = Transitions(*(field.repeat(400, 1)[:10_000] for field in pendulum.simulate(30)))

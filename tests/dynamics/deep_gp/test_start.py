@@ -7,18 +7,18 @@ import pytest
 import torch
 
 from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.dynamics.deep_gp.start import INNER_VARIANCE, cluster, initial_model, relocate, restandardise
 from gym_dgpmpc.gp.deep_gp import factorise_all, log_likelihood, propagate
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.gp.layer import conditional
-from gym_dgpmpc.inference.mcem import Data
 from tests.oracles.models import make_model, normal, seeded
 
 
-def mean_function(kernel, model, whitened, x):
+def mean_function(model, whitened, x):
     """The composition of the layers' means."""
-    for layer, factor, v in zip(model.layers, factorise_all(kernel, model), model.split(whitened), strict=True):
-        mean = conditional(kernel, layer, factor, v, x)[0]
+    for layer, factor, v in zip(model.layers, factorise_all(model).factors, model.split(whitened), strict=True):
+        mean = conditional(layer, factor, v, x)[0]
         x = mean if layer is model.layers[-1] else x + mean
     return x
 
@@ -28,7 +28,7 @@ def mean_function(kernel, model, whitened, x):
 def test_restandardising_keeps_the_function_of_raw_inputs(kernel, num_layers):
     """Up to the shift of the targets' mean, which is left to training."""
     generator = seeded(1)
-    model = make_model(num_layers, 3, 2, 6, generator)
+    model = make_model(num_layers, 3, 2, 6, generator, kernel)
     whitened, raw = normal(generator, model.num_whitened()), normal(generator, 10, 3)
 
     def normalisers(seed):
@@ -37,8 +37,8 @@ def test_restandardising_keeps_the_function_of_raw_inputs(kernel, num_layers):
 
     old, new = normalisers(2), normalisers(3)
     moved, moved_whitened = restandardise(model, whitened, old, new)
-    before = mean_function(kernel, model, whitened, old[0](raw)) * old[1].std
-    after = mean_function(kernel, moved, moved_whitened, new[0](raw)) * new[1].std
+    before = mean_function(model, whitened, old[0](raw)) * old[1].std
+    after = mean_function(moved, moved_whitened, new[0](raw)) * new[1].std
     torch.testing.assert_close(after, before, rtol=1e-7, atol=1e-7)
     # The noise, too, is the same in raw units, and its floor is not.
     noise = model.log_noise.exp() * old[1].std.square()
@@ -69,7 +69,7 @@ def test_a_common_stretch_of_the_targets_keeps_the_whole_predictive_law():
     moved, moved_whitened = restandardise(model, whitened, old, new)
     densities = []
     for each, v, scale in ((model, whitened, 1.0), (moved, moved_whitened, 0.3)):
-        mean, variance = propagate("rbf", each, factorise_all("rbf", each), each.split(v), x, generator)
+        mean, variance = propagate(factorise_all(each), each.split(v), x, generator)
         densities.append(log_likelihood(each, mean, variance, raw_y / scale) - 2 * math.log(scale))
     torch.testing.assert_close(densities[1], densities[0], rtol=1e-4, atol=1e-4)  # the noise floor does not scale
 
@@ -79,11 +79,11 @@ def test_a_common_stretch_of_the_targets_keeps_the_whole_predictive_law():
 def test_relocating_to_the_data_keeps_the_mean_function_there(kernel, num_layers):
     """With no more rows than inducing inputs every row is one of them, in every layer: nothing but jitter is lost."""
     generator = seeded(1)
-    model = make_model(num_layers, 2, 2, 15, generator)
+    model = make_model(num_layers, 2, 2, 15, generator, kernel)
     whitened = 0.5 * normal(generator, model.num_whitened())
     data = Data(normal(generator, 12, 2), normal(generator, 12, 2))
-    moved, moved_whitened = relocate(kernel, model, whitened, data, generator)
-    before, after = (mean_function(kernel, m, v, data.x) for m, v in ((model, whitened), (moved, moved_whitened)))
+    moved, moved_whitened = relocate(model, whitened, data, generator)
+    before, after = (mean_function(m, v, data.x) for m, v in ((model, whitened), (moved, moved_whitened)))
     torch.testing.assert_close(after, before, rtol=0, atol=5e-3 * before.std().item())
     assert torch.equal(moved.layers[0].inducing_inputs[:12], data.x)
     assert moved.log_noise is model.log_noise
@@ -97,8 +97,8 @@ def test_relocating_among_more_data_than_inducing_inputs_keeps_a_smooth_function
     model = make_model(num_layers, 2, 1, 40, generator)
     whitened = 0.5 * normal(generator, model.num_whitened())
     data = Data(normal(generator, 300, 2), normal(generator, 300, 1))
-    moved, moved_whitened = relocate("rbf", model, whitened, data, generator)
-    before, after = (mean_function("rbf", m, v, data.x) for m, v in ((model, whitened), (moved, moved_whitened)))
+    moved, moved_whitened = relocate(model, whitened, data, generator)
+    before, after = (mean_function(m, v, data.x) for m, v in ((model, whitened), (moved, moved_whitened)))
     error = (after - before).square().mean().sqrt()
     assert error < 0.1 * before.std()
 
@@ -132,15 +132,16 @@ def test_rows_that_are_all_the_same_are_quietly_clustered_and_factorised(num_row
     assert centres.shape == (7, 2) and centres.isfinite().all()
     model = make_model(1, 2, 1, 7, seeded())
     model = model._replace(layers=(model.layers[0]._replace(inducing_inputs=centres),))
-    assert factorise_all("rbf", model)[0].isfinite().all()
+    assert factorise_all(model).factors[0].isfinite().all()
 
 
 @pytest.mark.parametrize("num_layers", [1, 3])
 def test_the_initial_model_has_the_published_settings(num_layers):
     data = Data(normal(seeded(), 30, 4), normal(seeded(1), 30, 2))
-    model = initial_model(data, num_layers, 10, seeded(2))
+    model = initial_model(KERNELS["matern32"], data, num_layers, 10, seeded(2))
     assert [round(float(layer.variance), 6) for layer in model.layers] == [INNER_VARIANCE] * (num_layers - 1) + [1.0]
     for layer in model.layers:
+        assert layer.kernel is KERNELS["matern32"]
         assert layer.inducing_inputs.shape == (10, 4)
         torch.testing.assert_close(layer.lengthscale, torch.full((4,), 2.0, dtype=torch.float64))
     assert len({layer.inducing_inputs.data_ptr() for layer in model.layers}) == num_layers, "each its own"

@@ -12,7 +12,7 @@ from tests.oracles.models import normal, seeded
 
 
 def fitted(num_steps=60, data=None, **settings):
-    model = SparseGPDynamics(2, 1, pendulum.SPEC, **({"num_inducing": 20, "max_iterations": 40} | settings))
+    model = SparseGPDynamics(2, 1, pendulum.SPEC, **({"num_inducing": 20, "max_training_iterations": 40} | settings))
     model.fit(pendulum.simulate(num_steps) if data is None else data, seeded())
     return model
 
@@ -28,7 +28,7 @@ def one_step(model, data, num_particles=2000, seed=1):
 
 
 def test_it_predicts_the_pendulum():
-    model, test = fitted(150, max_iterations=100), pendulum.simulate(60, seed=1)
+    model, test = fitted(150, max_training_iterations=100), pendulum.simulate(60, seed=1)
     error = (one_step(model, test, 50).mean(0) - test.next_observation).square().mean(0).sqrt()
     still = (test.next_observation - test.observation).square().mean(0).sqrt()
     assert bool((error < 0.1 * still).all())
@@ -84,7 +84,7 @@ def test_with_few_transitions_each_is_an_inducing_point(num_steps):
 
 def test_inducing_inputs_start_from_different_rows_of_the_data():
     data = pendulum.simulate(60)
-    model = SparseGPDynamics(2, 1, pendulum.SPEC, num_inducing=20, max_iterations=1)
+    model = SparseGPDynamics(2, 1, pendulum.SPEC, num_inducing=20, max_training_iterations=1)
     model.fit(data, seeded())
     raw = model.encoder.inputs(data.observation.double(), data.action.double())
     rows = Normaliser.fit(raw)(raw)
@@ -137,11 +137,11 @@ def test_the_exact_model_within_an_episode_is_exact_too():
 def test_later_trainings_start_from_the_last_one():
     """One iteration from a converged model loses nothing; one from the beginning is far behind."""
     data = pendulum.simulate(80)
-    first = SparseGPDynamics(2, 1, pendulum.SPEC, exact=True, max_iterations=100)
+    first = SparseGPDynamics(2, 1, pendulum.SPEC, exact=True, max_training_iterations=100)
     converged = first.fit(data, seeded())["bound"]
-    first.max_iterations = 1
+    first.max_training_iterations = 1
     again = first.fit(data, seeded())["bound"]
-    fresh = SparseGPDynamics(2, 1, pendulum.SPEC, exact=True, max_iterations=1).fit(data, seeded())["bound"]
+    fresh = SparseGPDynamics(2, 1, pendulum.SPEC, exact=True, max_training_iterations=1).fit(data, seeded())["bound"]
     assert again >= converged - 1e-6 > fresh + 0.1
 
 
@@ -149,7 +149,7 @@ def test_later_trainings_start_from_the_last_one():
     ("settings", "message"),
     [
         ({"num_inducing": 0}, "num_inducing must be at least 1, got 0"),
-        ({"max_iterations": 0}, "max_iterations must be at least 1, got 0"),
+        ({"max_training_iterations": 0}, "max_training_iterations must be at least 1, got 0"),
         ({"draw": "TS1"}, "unknown draw 'TS1': expected one of DS, MM, AMM"),
         ({"kernel": "cubic"}, "unknown kernel 'cubic'"),
         ({"kernel": "matern32", "draw": "AMM"}, "AMM has closed forms for the kernel 'rbf' only, received 'matern32'"),

@@ -67,7 +67,7 @@ def trained(draw="AMM", **settings):
     after[:, 1] = torch.cos(before[:, 0]) * 0.8
     after[:, 2] += 0.2 * before[:, 0] * before[:, 1]
     after[:, :3] += 0.05 * normal(generator, 80, 3)
-    model = SparseGPDynamics(4, 1, SPEC, num_inducing=25, max_iterations=60, draw=draw, **settings)
+    model = SparseGPDynamics(4, 1, SPEC, num_inducing=25, max_training_iterations=60, draw=draw, **settings)
     model.fit(Transitions(before.float(), action.float(), after.float()), seeded())
     return model
 

@@ -1,8 +1,8 @@
 // Rollouts through functions that are fixed for a plan, in one pass and in single precision.
 //
-// `dynamics/deep_gp/compiled_rollout.py` packs what `PathwiseSampler` drew into a Task and calls `rollout` for one particle and
-// a range of candidates; several threads may do so at the same time. Every candidate's trajectory is independent of the
-// others, so a call runs through all steps by itself. Per step and layer each point goes through
+// `dynamics/deep_gp/compiled_rollout.py` packs what `PathwiseSampler` drew into a Task and calls `rollout` for one
+// particle and a range of candidates; several threads may do so at the same time. Every candidate's trajectory is
+// independent of the others, so a call runs through all steps by itself. Per step and layer each point goes through
 //
 //     f(x) = sum_m k(argument_m(x)) kernel_out_m + sum_i cos(2 pi turns_i(x)) feature_out_i
 //
@@ -38,6 +38,8 @@ typedef int32_t ivec __attribute__((vector_size(4 * LANES)));
 extern "C" {
 
 struct Layer {
+  int64_t kernel;             // see `kernel_number`
+  float argument_scale;       // c
   int64_t outputs;            // O
   const float *inverse_lengthscale;  // [D]
   const float *centres;       // [M / UNITS, D, UNITS], M padded with zeros to a multiple of UNITS
@@ -53,8 +55,6 @@ struct Task {
   int64_t num_particles, num_candidates, horizon;      // P, K, H
   int64_t num_layers, num_inducing, num_features;      // L, and M and F padded
   int64_t num_functions;                               // T: H, or 1
-  int64_t kernel;                                      // position in KERNELS
-  float argument_scale;                                // c
   const int64_t *input_kind;    // [D]: 0 the number itself, 1 its sine, 2 its cosine, 3 a number of the action,
                                 // 4, 5 the part of a vector forwards and to the left of the body
   const int64_t *input_source;  // [D]: which number or vector
@@ -63,7 +63,7 @@ struct Task {
   const float *spread;                                 // [S]
   const int64_t *target;                               // [S]: which output, or -1
   int64_t num_vectors;
-  const int64_t *vectors;       // [num_vectors, 3]: where heading, x and y are; what is added to x and y is along the body
+  const int64_t *vectors;       // [num_vectors, 3]: where heading, x and y are; what is added to x, y is along the body
   const Layer *layers;                                 // [L]
   const float *start;                                  // [S]
   const float *actions;                                // [K, H, A]
@@ -72,8 +72,6 @@ struct Task {
 }
 
 namespace {
-
-enum Kernel { RBF, MATERN52, MATERN32, MATERN12 };
 
 inline vec all(float value) { return vec{} + value; }
 
@@ -146,16 +144,46 @@ inline vec reduced(vec angle) {
   return (r - n * 1.9353072e-3f) * 0.159154943f;
 }
 
-// The kernel with unit variance from c r^2; see `correlation_` in gp/kernels.py for the formulas and the range.
-template <int KERNEL>
-inline vec correlation(vec argument) {
-  if (KERNEL == RBF) return exponential(clamped(argument, -60.0f, 0.0f));
-  vec s = square_root(clamped(argument, 0.0f, 3600.0f));
-  vec decay = exponential(-s);
-  if (KERNEL == MATERN12) return decay;
-  if (KERNEL == MATERN32) return s * decay + decay;
-  return (s * s * (1.0f / 3.0f) + s + 1.0f) * decay;
-}
+// Kernels with unit variance from c r^2, by the names of gp/kernels.py, which has their formulas; `correlation_` there
+// says what the range is for. A new one is a struct here and its place in KERNEL_TYPES.
+struct RBF {
+  static constexpr const char *name = "rbf";
+  static inline vec correlation(vec argument) { return exponential(clamped(argument, -60.0f, 0.0f)); }
+};
+
+// s = sqrt(2 nu) r of a Matern kernel.
+inline vec distance(vec argument) { return square_root(clamped(argument, 0.0f, 3600.0f)); }
+
+struct Matern12 {
+  static constexpr const char *name = "matern12";
+  static inline vec correlation(vec argument) { return exponential(-distance(argument)); }
+};
+
+struct Matern32 {
+  static constexpr const char *name = "matern32";
+  static inline vec correlation(vec argument) {
+    const vec s = distance(argument), decay = exponential(-s);
+    return s * decay + decay;
+  }
+};
+
+struct Matern52 {
+  static constexpr const char *name = "matern52";
+  static inline vec correlation(vec argument) {
+    const vec s = distance(argument);
+    return (s * s * (1.0f / 3.0f) + s + 1.0f) * exponential(-s);
+  }
+};
+
+struct Matern72 {
+  static constexpr const char *name = "matern72";
+  static inline vec correlation(vec argument) {
+    const vec s = distance(argument);
+    return (((s * (1.0f / 15.0f) + 0.4f) * s + 1.0f) * s + 1.0f) * exponential(-s);
+  }
+};
+
+#define KERNEL_TYPES RBF, Matern72, Matern52, Matern32, Matern12
 
 // One block of UNITS columns of the first product, for POINTS points: values = base + x . weights.
 inline void first_product(const vec *x, const float *weights, int64_t inputs, vec (&values)[UNITS][VECTORS]) {
@@ -180,14 +208,14 @@ inline void second_product(
 }
 
 // out [O, VECTORS] of POINTS points, whose inputs over the lengthscales are x [D, VECTORS].
-template <int KERNEL>
+template <class Kernel>
 void evaluate(const Task &task, const Layer &layer, const float *kernel_out, const float *feature_out, const vec *x,
               vec *out) {
   const int64_t inputs = task.input_size;
   vec square[VECTORS] = {};
   for (int64_t d = 0; d < inputs; d++)
     for (int v = 0; v < VECTORS; v++) square[v] += x[d * VECTORS + v] * x[d * VECTORS + v];
-  for (int v = 0; v < VECTORS; v++) square[v] *= task.argument_scale;
+  for (int v = 0; v < VECTORS; v++) square[v] *= layer.argument_scale;
   for (int64_t i = 0; i < layer.outputs * VECTORS; i++) out[i] = vec{};
 
   vec values[UNITS][VECTORS];
@@ -196,7 +224,7 @@ void evaluate(const Task &task, const Layer &layer, const float *kernel_out, con
       for (int v = 0; v < VECTORS; v++) values[j][v] = square[v] + layer.offsets[m + j];
     first_product(x, layer.centres + m * inputs, inputs, values);
     for (int j = 0; j < UNITS; j++)
-      for (int v = 0; v < VECTORS; v++) values[j][v] = correlation<KERNEL>(values[j][v]);
+      for (int v = 0; v < VECTORS; v++) values[j][v] = Kernel::correlation(values[j][v]);
     second_product(values, kernel_out + m, task.num_inducing, layer.outputs, out);
   }
   for (int64_t f = 0; f < task.num_features; f += UNITS) {
@@ -208,6 +236,21 @@ void evaluate(const Task &task, const Layer &layer, const float *kernel_out, con
     second_product(values, feature_out + f, task.num_features, layer.outputs, out);
   }
 }
+
+// The kernels by their numbers. Each layer has its own, so `evaluate` is called through a pointer: once for some ten
+// thousand numbers between the two products, which is nothing.
+struct Entry {
+  const char *name;
+  decltype(&evaluate<RBF>) evaluate;
+};
+
+template <class... Kernels>
+struct Table {
+  static constexpr Entry entries[] = {{Kernels::name, evaluate<Kernels>}...};
+  static constexpr int64_t size = sizeof...(Kernels);
+};
+
+using KERNELS = Table<KERNEL_TYPES>;
 
 // The part of a vector (heading, x, y) forwards, or to the left, of the body.
 inline vec along_body(const int64_t *vector, const vec *state, int v, bool forwards) {
@@ -275,7 +318,6 @@ void store(const vec *state, int64_t size, int64_t count, float *rows) {
     for (int64_t s = 0; s < size; s++) rows[i * size + s] = lanes[s * POINTS + i];
 }
 
-template <int KERNEL>
 void run(const Task &task, int64_t particle, int64_t first, int64_t last, vec *scratch) {
   const int64_t size = task.observation_size, inputs = task.input_size;
   const int64_t blocks = (last - first + POINTS - 1) / POINTS;
@@ -304,8 +346,9 @@ void run(const Task &task, int64_t particle, int64_t first, int64_t last, vec *s
         for (int64_t d = 0; d < inputs; d++)
           for (int v = 0; v < VECTORS; v++)
             scaled[d * VECTORS + v] = input[d * VECTORS + v] * layer.inverse_lengthscale[d];
-        evaluate<KERNEL>(task, layer, layer.kernel_out + function * layer.outputs * task.num_inducing,
-                         layer.feature_out + function * layer.outputs * task.num_features, scaled, out);
+        KERNELS::entries[layer.kernel].evaluate(
+            task, layer, layer.kernel_out + function * layer.outputs * task.num_inducing,
+            layer.feature_out + function * layer.outputs * task.num_features, scaled, out);
         if (l + 1 < task.num_layers)
           for (int64_t i = 0; i < inputs * VECTORS; i++) input[i] += out[i];
       }
@@ -322,6 +365,13 @@ extern "C" {
 int64_t units() { return UNITS; }
 int64_t points() { return POINTS; }
 
+// By which number a Layer names this kernel; -1 if there is none of that name.
+int64_t kernel_number(const char *name) {
+  for (int64_t i = 0; i < KERNELS::size; i++)
+    if (!strcmp(KERNELS::entries[i].name, name)) return i;
+  return -1;
+}
+
 // Roll out the candidates first..last-1 of one particle. Returns 0, or 1 if there was no memory.
 int64_t rollout(const Task *task, int64_t particle, int64_t first, int64_t last) {
   const int64_t blocks = (last - first + POINTS - 1) / POINTS;
@@ -330,12 +380,7 @@ int64_t rollout(const Task *task, int64_t particle, int64_t first, int64_t last)
   void *memory = nullptr;
   if (posix_memalign(&memory, sizeof(vec), rows * VECTORS * sizeof(vec))) return 1;
   vec *scratch = (vec *)memory;
-  switch (task->kernel) {
-    case RBF: run<RBF>(*task, particle, first, last, scratch); break;
-    case MATERN52: run<MATERN52>(*task, particle, first, last, scratch); break;
-    case MATERN32: run<MATERN32>(*task, particle, first, last, scratch); break;
-    default: run<MATERN12>(*task, particle, first, last, scratch);
-  }
+  run(*task, particle, first, last, scratch);
   free(memory);
   return 0;
 }

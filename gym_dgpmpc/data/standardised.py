@@ -1,0 +1,44 @@
+"""Standardised inputs and targets, as the models train on them, and minibatches of them.
+
+Between `normaliser.py`, which makes them, and what trains: `inference/` and `dynamics/`.
+"""
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+class Data(NamedTuple):
+    """Standardised inputs and targets, float64."""
+
+    x: Float[Tensor, "N D"]
+    y: Float[Tensor, "N T"]
+
+    @property
+    def num_rows(self) -> int:
+        """N."""
+        return self.x.shape[0]
+
+    def rows(self, index: Int[Tensor, "n"]) -> "Data":
+        """Some of the rows."""
+        return Data(self.x[index], self.y[index])
+
+
+@runtime_checkable
+class DataSource(Protocol):
+    """Where minibatches come from: `Data`, or something that standardises only the rows that are asked for."""
+
+    @property
+    def num_rows(self) -> int: ...
+
+    def rows(self, index: Int[Tensor, "n"]) -> Data: ...
+
+
+def minibatch(data: DataSource, size: int, generator: torch.Generator) -> Data:
+    """``size`` rows drawn uniformly with replacement; everything if there are no more than that."""
+    num_rows = data.num_rows
+    if num_rows <= size:
+        return data if isinstance(data, Data) else data.rows(torch.arange(num_rows, device=generator.device))
+    return data.rows(torch.randint(num_rows, (size,), generator=generator, device=generator.device))
