@@ -12,7 +12,7 @@ MODULES = {
 }
 
 LAYERS = (
-    {"types", "errors", "checks", "randomness"},
+    {"types", "errors", "checks", "randomness", "settings"},
     {"envs", "wrappers"},
     {"data"},
     {"gp"},

@@ -49,7 +49,14 @@ def distance(observation, action, next_observation):
     return -next_observation[..., 0].abs()
 
 
-TASK = Task(None, spaces.Box(-9.0, 9.0, (1,)), SPACE, TaskArguments(distance, None, None), torch.device("cpu"))
+
+
+def a_task(reward_fn):
+    observations = spaces.Box(-9.0, 9.0, (1,))
+    return Task(None, observations, SPACE, TaskArguments(reward_fn, None, None), torch.device("cpu"))
+
+
+TASK = a_task(distance)
 
 
 def controller(name="one sequence", **arguments):
@@ -185,7 +192,7 @@ def test_what_a_planner_returns_is_checked(actions, message):
 
 
 def test_a_reward_that_is_never_finite_names_the_observation():
-    task = TASK._replace(reward_fn=lambda observation, action, next_observation: math.nan * next_observation[..., 0])
+    task = a_task(lambda observation, action, next_observation: math.nan * next_observation[..., 0])
     control = controller()
     with pytest.raises(PlanningError, match=r"finite score.*observation \[0.5\]"):
         control.act(task, OBSERVATION, control.cold, seeded())

@@ -89,7 +89,7 @@ class TestVector:
         assert known.terminated_fn(after).tolist() == [False, True]
         assert vector.functions(TaskFunctions(None, None, "learned", "never")).terminated_fn is None
         plain = TaskFunctions(far, far)
-        assert ModelledVector(3, self.spec).task(plain) == plain
+        assert ModelledVector(3, self.spec).functions(plain) == plain
         with pytest.raises(ValueError, match="got neither"):
             ModelledVector(3, self.spec).functions(TaskFunctions(None, None, "learned"))
 
@@ -106,7 +106,7 @@ def test_a_learned_reward_scores_as_the_known_one_does():
         for step in range(5):
             states.append(sampler(states[-1], actions[:, step], step))
     states = torch.stack(states)
-    predicted = particle_returns(states, actions, learner.task.modelled.task(learner.task).reward_fn)
+    predicted = particle_returns(states, actions, learner.task.modelled.functions(learner.task.functions).reward_fn)
     known = particle_returns(states, actions, lambda o, a, n: -n[..., 0])
     # Five steps, each off by the spread times the size of its inputs (1, velocity and force, below 4) at 4 sigma.
     torch.testing.assert_close(predicted, known, rtol=0, atol=5 * 4 * 4e-3)
@@ -235,7 +235,7 @@ def test_a_run_that_learns_its_reward_resumes_exactly(tmp_path):
     whole = made().learn(47)
     made().learn(28, run_folder=tmp_path)
     resumed = made().learn(47, run_folder=tmp_path, resume=True)
-    assert resumed.modelled.terminated and resumed.modelled.reward
+    assert resumed.task.modelled.terminated and resumed.task.modelled.reward
     # The environment is no simulator that may be driven by a recording: it goes on from the last episode's end.
     assert torch.equal(whole.store.rewards[:20], resumed.store.rewards[:20])
     assert len(resumed.store) == 47
