@@ -1,8 +1,8 @@
 """The paper's dynamics model: a deep Gaussian process over transitions, sampled by SG-HMC.
 
 Prepares data for `inference/`, keeps what it returns (hyperparameters, chain, pool of posterior samples), and makes
-the draws of `draws.py` from the pool. The agent calls `fit` at an episode's start, `resample` after each
-control step and `draw` for each plan.
+the draws of `draws.py` from the pool. The agent calls `fit` at an episode's start, `resample` after each control step
+and `draw` for each plan.
 """
 
 import math
@@ -78,22 +78,24 @@ class DeepGPDynamics(Learner[_Fitted]):
         observation_size: S.
         action_size: A.
         observation_spec: how to read the observation.
-        num_layers: L, at least 1.
-        kernel: of every layer, a name in `KERNELS`, with one lengthscale per input dimension.
+        num_layers: L, layers of the deep GP, at least 1.
+        kernel: of every layer, with one lengthscale per input; a name in `gp.kernels.KERNELS`, such as "matern32".
         num_inducing: M, inducing points per layer.
-        draw: "pathwise", "joint" or "marginal"; see `draws.py`.
+        draw: how a world is drawn from the posterior: "pathwise" (functions), "joint" (values, jointly across the
+            candidate sequences, as in the paper) or "marginal" (values, independently).
         refresh: for "pathwise": a new function per particle at each "step" of a plan, or one for the whole "plan".
         num_features: F, random features of a pathwise draw; its prior covariance errs by F^-1/2.
         first_training_iterations: training iterations (one SG-HMC and one Adam step each) of the first fit.
         training_iterations: training iterations of each later fit.
-        num_samples: size of the pool of posterior samples.
+        num_samples: posterior samples kept, the pool; the particles of a plan are drawn from them.
         sample_spacing: SG-HMC steps between two samples of the pool.
-        resample_steps: SG-HMC steps of one `resample`; 0 leaves the posterior as it is within an episode.
+        resample_steps: SG-HMC steps after each control step; 0 keeps the posterior as it is within an episode.
         resample_samples: samples of the pool that one `resample` replaces, if the last layer is drawn exactly; at
             least 1 (``resample_steps=0`` turns re-sampling off).
         relocate: move the inducing inputs to the grown data's cluster centres before each later fit.
-        compile: roll pathwise draws out in compiled code, several times faster; where there is no compiler, or for
-            another precision or device, PyTorch does it.
+        compile: roll pathwise draws out in compiled code, which a C++ compiler builds once in a few seconds; without
+            one, for a kernel that it does not have, or for another precision or device, PyTorch does it, several times
+            slower.
         dtype: precision of rollouts; training and every factorisation are in float64.
         device: where tensors live.
         **inference: the settings of `InferenceSettings`, each as a keyword argument of its own.

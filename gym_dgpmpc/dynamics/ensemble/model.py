@@ -61,7 +61,10 @@ class EnsembleDynamics(Learner[_Fitted]):
         learning_rate: of Adam.
         batch_size: transitions per member and gradient.
         num_epochs: passes over the data in one training.
-        draw: "TS1", "TSinf", "DS", "MM" or "expectation"; see `draws.py`.
+        draw: how particles move through the networks: "TS1", each through one drawn anew at each step; "TSinf", each
+            through its own for the whole plan; "DS", each by its own draw from the mean and variance of all; "MM", as
+            DS, then a candidate's particles are replaced by draws from their mean and variance; "expectation", along
+            the mean.
         half_precision: in rollouts, compute the layers between the first and the last in bfloat16: faster by a
             multiple on processors with instructions for it, and off by some 0.3 % of a prediction.
         dtype: precision of all else in rollouts; networks are trained in float32.

@@ -49,7 +49,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         observation_size: S.
         action_size: A.
         observation_spec: how to read the observation.
-        kernel: a name in `KERNELS`, with one lengthscale per input dimension.
+        kernel: with one lengthscale per input, shared by the outputs; a name in `gp.kernels.KERNELS`, such as "rbf".
         num_inducing: M, inducing points; of fewer transitions, each is one.
         exact: make every transition an inducing point and keep it there, which is the exact Gaussian process up to the
             jitter. Cost grows with the cube of the number of transitions: for small data.

@@ -48,7 +48,7 @@ def test_draws_have_the_moments_of_the_exact_regression(add_noise):
     (layer,), noise = model._fitted.model.layers, model._fitted.model.noise_variance
     assert torch.equal(state["inducing_inputs"], inputs(raw[0]))
     assert 1e-6 * layer.variance < 1e-3 * noise.min()
-    known = exact.regression("rbf", layer, noise, inputs(raw[0]), targets(target), inputs(raw[1]))
+    known = exact.regression(layer, noise, inputs(raw[0]), targets(target), inputs(raw[1]))
     mean = targets.inverse(known.mean) + test.observation
     variance = known.covariance.diagonal(dim1=-2, dim2=-1).mT.clamp_min(0.0) + (noise if add_noise else 0.0)
     std = variance.sqrt() * targets.std
@@ -123,7 +123,7 @@ def test_the_exact_model_within_an_episode_is_exact_too():
     layer, noise = model._fitted.model.layers[0], model._fitted.model.noise_variance
     x, y = (normalise(raw) for normalise, raw in zip(normalisers, model._encode(grown), strict=True))
     assert torch.equal(layer.inducing_inputs, x)
-    known = exact.regression("rbf", layer, noise, x, y, x)
+    known = exact.regression(layer, noise, x, y, x)
     mean = normalisers[1].inverse(known.mean) + grown.observation
     std = known.covariance.diagonal(dim1=-2, dim2=-1).mT.clamp_min(0.0).sqrt() * normalisers[1].std
     count = 2000
