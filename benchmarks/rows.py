@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from gym_dgpmpc.bench import markdown
+from benchmarks.report import markdown
 from gym_dgpmpc.checkpoints.files import replace_text
 
 Row = dict[str, Any]

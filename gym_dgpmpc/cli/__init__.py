@@ -1,4 +1,4 @@
-"""The command line: `dgpmpc train ENV_ID`, `evaluate PATH`, `bench SUITE` and `report DIR`, one module each.
+"""The command line: `dgpmpc train ENV_ID`, `evaluate PATH`, and in a clone `bench SUITE` and `report DIR`.
 
 Says what is wrong in one line, with exit code 2; stops with 130 after Ctrl-C and with 143 after SIGTERM. What is slow
 to import is imported when a command runs, so that `--help` answers at once.
@@ -10,11 +10,7 @@ from typing import Annotated
 import typer
 
 import gym_dgpmpc  # noqa: F401  # registers the environments
-from gym_dgpmpc.bench.report_command import report
-from gym_dgpmpc.cli import bench, evaluate, train
-
-COMMANDS = (train.train, evaluate.evaluate, bench.bench, report)
-"""In the order in which `dgpmpc --help` shows them."""
+from gym_dgpmpc.cli import benchmarks, evaluate, train
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -35,5 +31,7 @@ def main(
     """Sample-efficient model-predictive control with deep Gaussian processes."""
 
 
-for command in COMMANDS:
-    app.command()(command)
+# In the order in which `dgpmpc --help` shows them.
+app.command()(train.train)
+app.command()(evaluate.evaluate)
+benchmarks.add_benchmarks(app)
