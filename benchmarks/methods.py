@@ -162,7 +162,7 @@ def true_dynamics_agent(
 
 
 def dgp_mpc(num_layers: int, kernel: str) -> str:
-    """The name of DGP-MPC with so many layers of that kernel."""
+    """The name of DGP-MPC with this depth and kernel."""
     return f"DGP-MPC L={num_layers} {kernel}"
 
 
@@ -228,4 +228,4 @@ ALL_METHODS: tuple[Method, ...] = (
 )
 
 METHODS: Mapping[str, Method] = {method.name: method for method in ALL_METHODS}
-"""By name."""
+"""All methods by name."""

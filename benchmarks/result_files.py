@@ -48,7 +48,7 @@ class RunKey(NamedTuple):
 
     @property
     def file_name(self) -> str:
-        """Of letters, digits, dots, dashes and equals signs, so that it is valid on every system."""
+        """A name of letters, digits, dots, dashes and equals signs, which is valid on every system."""
         plain = [re.sub(r"[^A-Za-z0-9.=-]+", "-", part) for part in (self.task, self.method)]
         return f"{'_'.join(plain)}_seed{self.seed}.json"
 

@@ -36,7 +36,7 @@ def measure_missing(
     measure: Callable[[Row], Row],
     settings: argparse.ArgumentParser,
 ) -> str:
-    """Measure what the benchmark's files do not have, and write them anew after each measurement.
+    """Measure what the benchmark's files do not have, and write them again after each measurement.
 
     Args:
         name: of the benchmark and of its files, ``name.json`` and ``name.md``.

@@ -45,7 +45,7 @@ class Run:
         task: the task.
         seed: decides everything random.
         episodes: episodes to play, not counting random ones.
-        times: for methods without a model: they get so many times the steps of a planning agent.
+        times: for methods without a model: they get this many times the steps of a planning agent.
         steps_of: for methods without a model: the planning method whose steps on this task with this seed are meant.
             They are read from its result; without one, its episodes count as if none ended early.
         asked: settings in place of the method's own.

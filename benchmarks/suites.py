@@ -31,7 +31,7 @@ STOCK_TASKS = {
 }
 """Gymnasium's own tasks, and the episodes on each after a random one."""
 STOCK_TIMES = 10
-"""SAC gets so many times the steps of DGP-MPC."""
+"""SAC gets this many times the steps of DGP-MPC."""
 
 
 class SuiteError(DGPMPCError, ValueError):
@@ -223,7 +223,7 @@ _OF_RUNS = (
 )
 
 SUITES: Mapping[str, Suite] = {**{suite.name: suite for suite in _OF_RUNS}, "contact": ContactSuite()}
-"""By name."""
+"""All suites by name."""
 
 
 def find_suite(name: str) -> Suite:

@@ -61,4 +61,4 @@ ALL_TASKS = (
 )
 
 TASKS: Mapping[str, Task] = {task.name: task for task in ALL_TASKS}
-"""By name."""
+"""All tasks by name."""

@@ -73,4 +73,4 @@ def test_a_package_in_a_clone_finds_its_benchmarks_from_any_folder(tmp_path):
     environment = os.environ | {"PYTHONPATH": path}
     result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
-    assert result.stdout.splitlines()[-1].startswith("36 jobs: 36 finished")
+    assert result.stdout.splitlines()[-1].startswith("36 jobs: ")

@@ -28,7 +28,7 @@ Curve = tuple[Float[ndarray, " H"], Float[ndarray, " H"], Float[ndarray, " H"]]
 SAMPLE_COLOUR, TRUTH_COLOUR = "tab:blue", "tab:red"
 
 KERNEL_NAMES = {**paper.KERNELS, "rbf": "RBF"}
-"""From smooth to rough."""
+"""Names of the kernels in tables and figures, from smooth to rough."""
 
 KERNEL_COLOURS = dict(zip(KERNEL_NAMES, ("#0072B2", "#009E73", "#E69F00", "#D55E00"), strict=True))
 """Four of Okabe and Ito's palette, which colour-blind readers can tell apart."""

@@ -66,7 +66,7 @@ def report_contact_study(folder: Path, out: Path) -> list[Path]:
 def paired_differences(
     study: Study, pairs: Sequence[tuple[Setting, Setting]], score: str, phase: str | None = None
 ) -> Float[ndarray, " n"]:
-    """For each seed that has all runs of ``pairs``, the mean over them of the first's score less the second's.
+    """The mean over ``pairs`` of the first's score less the second's, for each seed that has all of their runs.
 
     Args:
         study: the runs of one case.
@@ -89,7 +89,7 @@ def estimate(values: Float[ndarray, " n"]) -> Estimate:
 
 
 def _written(value: Estimate) -> str:
-    """With three decimals, since a CRPS is a few hundredths."""
+    """An estimate with three decimals, since a CRPS is a few hundredths."""
     return markdown.estimate(value, decimals=3)
 
 

@@ -27,10 +27,10 @@ PANEL = (3.3, 2.6)
 """Width and height of a panel with its labels, in inches."""
 
 RATIO_FOR_LOG = 3.0
-"""If the longest method's runs are so many times longer than the shortest's, the horizontal axis is logarithmic."""
+"""The horizontal axis is logarithmic if the longest method's runs are this many times longer than the shortest's."""
 
 DECADES_ALONE = 3000.0
-"""From so large a ratio of its ends on, a logarithmic axis has numbers at powers of ten alone: more would overlap."""
+"""A logarithmic axis whose ends have this ratio or more has numbers at powers of ten alone: others would overlap."""
 
 AXIS = {"steps": "environment steps", "minutes": "wall-clock time (minutes)"}
 EARNED = {"return": "return of an episode", "best": "maximum seen return"}

@@ -27,7 +27,7 @@ def cell(text: str) -> str:
 
 
 def number(value: float | None, decimals: int | None = None) -> str:
-    """With a true minus sign, and with ``decimals`` or else about four figures; a dash for None and NaN."""
+    """A number with ``decimals``, or else about four figures, and a true minus sign; a dash for None and NaN."""
     if value is None or math.isnan(value):
         return NOTHING
     if decimals is None:

@@ -1,4 +1,4 @@
-"""From result files to numbers: what a run earned by a number of steps, and which runs can be compared with which."""
+"""Numbers from result files: what a run earned by a number of steps, and which runs can be compared with which."""
 
 import math
 import re
@@ -111,7 +111,7 @@ def common_steps(runs: Runs) -> int:
 
 
 def until(result: RunResult, steps: float = math.inf) -> list[Episode]:
-    """The counted episodes that ended within so many environment steps of the run."""
+    """The counted episodes that ended within ``steps`` environment steps of the run."""
     return [episode for episode in result.counted if episode.total_steps <= steps]
 
 

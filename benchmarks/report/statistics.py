@@ -17,7 +17,7 @@ from scipy import stats
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
 SEED = 0
-"""Of the resampling: the same runs give the same interval, whatever else is in a report."""
+"""Seed of the resampling: the same runs give the same interval, whatever else is in a report."""
 
 TRIMMED = 0.25
 """Share that the interquartile mean leaves out at each end."""
@@ -119,7 +119,7 @@ def _iqm(*strata: ndarray, axis: int) -> ndarray:
 
 
 def _improvement(*strata: ndarray, axis: int) -> ndarray:
-    """Of the samples the first half are X's tasks, the others Y's."""
+    """P(X > Y) + P(X = Y) / 2; the first half of the samples are X's tasks, the others Y's."""
     wins = []
     for x, y in zip(strata[: len(strata) // 2], strata[len(strata) // 2 :], strict=True):
         first, second = np.moveaxis(x, axis, -1)[..., :, None], np.moveaxis(y, axis, -1)[..., None, :]

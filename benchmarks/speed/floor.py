@@ -12,7 +12,7 @@ NUM_FEATURES = 128
 
 
 def outputs(case: Case, num_layers: int) -> list[int]:
-    """Of each layer."""
+    """The number of outputs of each layer, from the first to the last."""
     encoder = Encoder(case.observation_size, case.action_size, case.spec)
     return [encoder.input_size] * (num_layers - 1) + [encoder.target_size]
 

@@ -64,7 +64,7 @@ def _is_clone(folder: Path) -> bool:
 
 
 def _finds(clone: Path) -> bool:
+    """Whether ``import benchmarks`` would import those of the clone."""
     spec = importlib.util.find_spec("benchmarks")
-    return (
-        spec is not None and spec.origin is not None and os.path.samefile(spec.origin, clone / "benchmarks/__init__.py")
-    )
+    ours = clone / "benchmarks" / "__init__.py"
+    return spec is not None and spec.origin is not None and os.path.realpath(spec.origin) == os.path.realpath(ours)
