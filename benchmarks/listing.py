@@ -69,7 +69,7 @@ def summary(lines: Sequence[Line]) -> str:
         text += f"; about {hours(sum(known))} of one process"
         text += f" for {len(known)} of them" if len(known) < len(left) else ""
     unknown = len(left) - len(known)
-    return text + (f"; {unknown} of them take an unknown time" if unknown else "")
+    return text + (f"; no estimate for {unknown} of them" if unknown else "")
 
 
 def hours(seconds: float) -> str:

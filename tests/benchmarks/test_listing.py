@@ -30,7 +30,7 @@ def test_what_is_left_takes_as_long_as_its_steps_at_that_pace(folders, monkeypat
     job, unknown = Run(DGP, TOY, 0, 4, asked=TINY[DGP]), Run("PPO", TOY, 0, 4)
     lines = survey([job, unknown], folders)
     assert [line.seconds_left for line in lines] == [2.0 * 5 * EPISODE_STEPS, None]
-    expected = "2 jobs: 0 finished, 2 left; about 2 min of one process for 1 of them; 1 of them take an unknown time"
+    expected = "2 jobs: 0 finished, 2 left; about 2 min of one process for 1 of them; no estimate for 1 of them"
     assert summary(lines).startswith(expected)
     monkeypatch.setattr(Run, "episodes_so_far", lambda *_: 3)
     (line,) = survey([job], folders)
