@@ -16,6 +16,7 @@ import gymnasium
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
+from benchmarks import RESULTS
 from benchmarks.calibration import random_episode, score
 from benchmarks.rows import Row, measure_missing
 from gym_dgpmpc import DGPMPCAgent
@@ -82,7 +83,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.ablation", description=__doc__, parents=[SETTINGS])
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS), metavar="VARIANT")
     parser.add_argument("--seeds", nargs="+", type=int, default=[100, 101])
-    parser.add_argument("--results", type=Path, default=Path("benchmarks/results/ablation"))
+    parser.add_argument("--results", type=Path, default=RESULTS / "ablation")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     settings = {"environment": arguments.environment, "steps": arguments.steps}

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks import RESULTS
 from benchmarks.rows import Row, measure_missing
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.types import DynamicsModel, Transitions
@@ -108,7 +109,7 @@ def measure(wanted: Row) -> Row:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.calibration", description=__doc__, parents=[SETTINGS])
     parser.add_argument("--seeds", nargs="+", type=int, default=[100, 101])
-    parser.add_argument("--results", type=Path, default=Path("benchmarks/results/calibration"))
+    parser.add_argument("--results", type=Path, default=RESULTS / "calibration")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     settings = {"layers": arguments.layers, "kernel": arguments.kernel}

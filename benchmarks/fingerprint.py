@@ -25,7 +25,7 @@ from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.planning import CEM
 
 STEPS = 12
-"""Of an episode."""
+"""Length of an episode."""
 
 PLANNING = {"num_candidates": 30, "horizon": 6, "num_iterations": 2}
 DEEP_GP = {
@@ -86,7 +86,7 @@ def digest(*arrays: Any) -> str:
 
 
 def fingerprint(agent_of: Callable[..., Any], env_of: Callable[[], Any], settings: dict[str, Any], keep: Path) -> str:
-    """Two episodes, the third in a new agent that goes on from the folder; then some predictions."""
+    """Two episodes, the third in a new agent that continues from the folder; then some predictions."""
     num_envs = getattr(env_of(), "num_envs", 1)
     with tempfile.TemporaryDirectory() as folder:
         for steps in (2 * STEPS + 4, 3 * STEPS):  # killed within the third episode

@@ -11,22 +11,31 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
 import torch
 
+from benchmarks import RESULTS
+from benchmarks.report import markdown
 from benchmarks.rows import Row, command
 from gym_dgpmpc import DGPMPCAgent
 from gym_dgpmpc.agents.presets import REAL_TIME
-from gym_dgpmpc.bench import markdown
 from gym_dgpmpc.checkpoints.files import replace_text
 from gym_dgpmpc.runs.provenance import machine, versions
 
 
-def control(agent: DGPMPCAgent, env: gymnasium.Env, seeds: range) -> dict[str, Any]:
-    """Returns of one episode per seed, and quantiles of the milliseconds that an action took."""
+@runtime_checkable
+class Controller(Protocol):
+    """What chooses the actions, such as an agent."""
+
+    def predict(self, observation: np.ndarray, state: Any = None) -> tuple[np.ndarray, Any]:
+        """The next action, and what the next call needs as ``state``."""
+
+
+def control(agent: Controller, env: gymnasium.Env, seeds: range) -> dict[str, Any]:
+    """Returns of one episode per seed, and quantiles of the milliseconds that choosing an action takes."""
     returns, times = [], []
     for seed in seeds:
         observation, _ = env.reset(seed=seed)
@@ -49,7 +58,7 @@ def main() -> None:
     parser.add_argument("--env", default="ModCartPole-v0")
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--results", type=Path, default=Path("benchmarks/results/speed"))
+    parser.add_argument("--results", type=Path, default=RESULTS / "speed")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     env, load = gymnasium.make(arguments.env), os.getloadavg()[0]

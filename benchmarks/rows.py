@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from gym_dgpmpc.bench import markdown
+from benchmarks.report import markdown
 from gym_dgpmpc.checkpoints.files import replace_text
 
 Row = dict[str, Any]
@@ -36,7 +36,7 @@ def measure_missing(
     measure: Callable[[Row], Row],
     settings: argparse.ArgumentParser,
 ) -> str:
-    """Measure what the benchmark's files do not have, and write them anew after each measurement.
+    """Measure what the benchmark's files do not have, and write them again after each measurement.
 
     Args:
         name: of the benchmark and of its files, ``name.json`` and ``name.md``.

@@ -1,4 +1,4 @@
-"""Under the tests, every jaxtyping annotation of the package is checked at each call; in production they are free.
+"""Under the tests, every jaxtyping annotation of both packages is checked at each call; in production they are free.
 
 The hook has to be installed before anything imports the package, and this file is what pytest imports first.
 """
@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 typechecked = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float, as in Python's own typing
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests.oracles, however pytest was started
-jaxtyping.install_import_hook("gym_dgpmpc", f"{__name__}.typechecked")
+jaxtyping.install_import_hook(["gym_dgpmpc", "benchmarks"], f"{__name__}.typechecked")
 
 torch.set_num_threads(1)  # the same sums in the same order on every machine, and no fight over cores
 

@@ -6,9 +6,13 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[1] / "gym_dgpmpc"
+CLONE = Path(__file__).parents[1]
+PACKAGE = CLONE / "gym_dgpmpc"
+BENCHMARKS = CLONE / "benchmarks"
 MODULES = {
-    "gym_dgpmpc." + ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for path in PACKAGE.rglob("*.py")
+    ".".join(path.relative_to(CLONE).with_suffix("").parts): path
+    for folder in (PACKAGE, BENCHMARKS)
+    for path in folder.rglob("*.py")
 }
 
 LAYERS = (
@@ -23,12 +27,13 @@ LAYERS = (
     {"checkpoints"},
     {"agents"},
     {"runs"},
-    {"bench"},
     {"__init__"},
     {"options", "cli"},
     {"__main__"},
+    {"benchmarks"},
 )
-"""Each layer imports only from itself and from those above it. The public names stand below all that they name."""
+"""Each layer imports only from itself and from those above it. The public names stand below all that they name, and the
+package `benchmarks`, which is not installed, below the whole of `gym_dgpmpc`."""
 
 MAX_LINES = 350
 
@@ -63,7 +68,7 @@ RUNS_CODE_FROM_FILES |= {"stable_baselines3.common.save_util", "torch.load", "to
 ALLOWED_ALL_THE_SAME = {
     # joblib's processes exchange pickles through pipes, with processes that this one has started; what loads and keeps
     # files (`joblib.load`, `joblib.dump`, `joblib.Memory`) stays forbidden there too.
-    "gym_dgpmpc.bench.executors": {
+    "benchmarks.executors": {
         "joblib", "joblib.Parallel", "joblib.delayed", "joblib.parallel_config",
         "joblib.externals.loky.process_executor", "joblib.externals.loky.process_executor.TerminatedWorkerError",
     },
@@ -99,8 +104,9 @@ def imports(tree: ast.AST) -> set[str]:
 
 
 def layer_of(name: str) -> int:
-    """The layer of a dotted name of this package: "gym_dgpmpc.gp.kernels" is in that of gp."""
-    part = name.split(".")[1] if "." in name else "__init__"
+    """The layer of a dotted name: "gym_dgpmpc.gp.kernels" is in that of gp, "benchmarks.run" in that of benchmarks."""
+    package, _, rest = name.partition(".")
+    part = "benchmarks" if package == "benchmarks" else rest.split(".")[0] or "__init__"
     for i, layer in enumerate(LAYERS):
         if part in layer:
             return i
@@ -109,7 +115,7 @@ def layer_of(name: str) -> int:
 
 def upward_imports(module: str, tree: ast.AST) -> list[str]:
     """Imports from a layer below the module's own."""
-    names = {name for name in imports(tree) if name.split(".")[0] == "gym_dgpmpc"}
+    names = {name for name in imports(tree) if name.split(".")[0] in ("gym_dgpmpc", "benchmarks")}
     # `from gym_dgpmpc import types` names the package itself too, but takes only the module from it.
     modules = {name.removesuffix(".__init__") for name in MODULES}
     names -= {"gym_dgpmpc"} if any(name.count(".") == 1 and name in modules for name in names) else set()
@@ -171,7 +177,7 @@ def tree(source):
 
 def test_every_package_has_a_layer():
     known = set().union(*LAYERS)
-    assert {name.split(".")[1] for name in MODULES} <= known
+    assert {name.split(".")[1] for name in MODULES if name.startswith("gym_dgpmpc.")} <= known
 
 
 def test_imports_only_from_above(module, tree):
@@ -224,6 +230,8 @@ def test_the_notation_names_what_there_is():
         ("gym_dgpmpc.gp.layer", "def f():\n    from gym_dgpmpc import cli", ["gym_dgpmpc.cli"]),
         ("gym_dgpmpc.agents.mpc", "from gym_dgpmpc import PETSAgent", ["gym_dgpmpc", "gym_dgpmpc.PETSAgent"]),
         ("gym_dgpmpc.types", "import gym_dgpmpc", ["gym_dgpmpc"]),
+        ("gym_dgpmpc.cli.benchmarks", "from benchmarks import run", ["benchmarks", "benchmarks.run"]),
+        ("benchmarks.run", "from gym_dgpmpc.cli import common\nimport benchmarks.jobs", []),
     ],
 )
 def test_upward_imports_are_found(module_name, line, found):

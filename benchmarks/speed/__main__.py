@@ -15,6 +15,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks import RESULTS
 from benchmarks.rows import command
 from benchmarks.speed.cases import CASES
 from benchmarks.speed.measure import WORKERS
@@ -43,7 +44,7 @@ def main() -> None:
     parser.add_argument("--layers", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--results", type=Path, default=Path("benchmarks/results/speed"))
+    parser.add_argument("--results", type=Path, default=RESULTS / "speed")
     parser.add_argument("--worker", choices=list(WORKERS), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.worker:

@@ -1,17 +1,18 @@
 """The bare arithmetic of a pathwise plan in PyTorch, without anything around it: what a plan is held against."""
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 
-from benchmarks.speed.cases import NUM_CANDIDATES, NUM_INDUCING, NUM_PARTICLES, Case
+from benchmarks.speed.cases import NUM_CANDIDATES, NUM_INDUCING, NUM_PARTICLES, Case, seeded
 from gym_dgpmpc.data.encoding import Encoder
 
 NUM_FEATURES = 128
 
 
 def outputs(case: Case, num_layers: int) -> list[int]:
-    """Of each layer."""
+    """The number of outputs of each layer, from the first to the last."""
     encoder = Encoder(case.observation_size, case.action_size, case.spec)
     return [encoder.input_size] * (num_layers - 1) + [encoder.target_size]
 
@@ -26,12 +27,13 @@ def rollout_flops(case: Case, num_layers: int) -> float:
 def bare_step(case: Case, num_layers: int) -> Callable[[], None]:
     """Products, square roots, exponentials and cosines of one rollout step, into buffers, a particle at a time."""
     size = Encoder(case.observation_size, case.action_size, case.spec).input_size
-    points = torch.randn(NUM_CANDIDATES, size + 2)
-    near, far = torch.randn(size + 2, NUM_INDUCING), torch.randn(size + 2, NUM_FEATURES)
+    random = partial(torch.randn, generator=seeded(0))
+    points = random(NUM_CANDIDATES, size + 2)
+    near, far = random(size + 2, NUM_INDUCING), random(size + 2, NUM_FEATURES)
     distances, waves = torch.empty(NUM_CANDIDATES, NUM_INDUCING), torch.empty(NUM_CANDIDATES, NUM_FEATURES)
-    positive = torch.rand(NUM_CANDIDATES, NUM_INDUCING) + 0.5
+    positive = torch.rand(NUM_CANDIDATES, NUM_INDUCING, generator=seeded(1)) + 0.5
     last = [
-        (torch.randn(NUM_INDUCING, out), torch.randn(NUM_FEATURES, out), torch.empty(NUM_CANDIDATES, out))
+        (random(NUM_INDUCING, out), random(NUM_FEATURES, out), torch.empty(NUM_CANDIDATES, out))
         for out in outputs(case, num_layers)
     ]
 
@@ -51,9 +53,10 @@ def bare_step(case: Case, num_layers: int) -> Callable[[], None]:
 
 def bare_training(num_layers: int, batch_size: int) -> Callable[[], None]:
     """What one training iteration cannot do without: per layer a Cholesky, four solves, four products, in float64."""
-    matrix = torch.randn(NUM_INDUCING, NUM_INDUCING, dtype=torch.float64)
+    random = partial(torch.randn, generator=seeded(0), dtype=torch.float64)
+    matrix = random(NUM_INDUCING, NUM_INDUCING)
     covariance = matrix @ matrix.mT + NUM_INDUCING * torch.eye(NUM_INDUCING, dtype=torch.float64)
-    right = torch.randn(NUM_INDUCING, batch_size, dtype=torch.float64)
+    right = random(NUM_INDUCING, batch_size)
 
     def iteration() -> None:
         for _ in range(num_layers):

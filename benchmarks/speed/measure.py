@@ -4,10 +4,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import torch
 
+from benchmarks.rows import Row
 from benchmarks.speed import floor, peers
 from benchmarks.speed.cases import (
     BATCH_SIZE,
@@ -35,8 +35,6 @@ from gym_dgpmpc.gp.deep_gp import factorise_all
 from gym_dgpmpc.inference import mcem, sghmc
 from gym_dgpmpc.inference.mcem import MCEM
 from gym_dgpmpc.planning.rollout import particle_returns, rollout
-
-Row = dict[str, Any]
 
 NUM_TRANSITIONS = 600
 
@@ -107,7 +105,7 @@ def parts(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
     model = deep_gp(case, num_layers, data)
     world = model.draw(NUM_PARTICLES, case.horizon, generator)
     states = rollout(world, data.observation[0], actions, NUM_PARTICLES)
-    square = torch.randn(1500, 1500)
+    square = torch.randn(1500, 1500, generator=generator)
     peak = timed(partial(torch.mm, square, square, out=torch.empty(1500, 1500)), repeats)["p50_ms"]
     row, times = {"what": "part of a plan"}, case.num_iterations
 

@@ -2,8 +2,8 @@
 
 from typing import Any
 
+from benchmarks.report import markdown
 from benchmarks.rows import Row, find
-from gym_dgpmpc.bench import markdown
 
 EXTRA = (
     "varied", "value", "extra_memory_mb", "seconds_to_compile", "product_gflops", "large_product_gflops", "by",

@@ -1,11 +1,10 @@
-"""The command line: `dgpmpc train ENV_ID`, `evaluate PATH`, `bench SUITE` and `report DIR`, one module each.
+"""The command line: `dgpmpc train ENV_ID`, `evaluate PATH`, and in a clone `bench SUITE` and `report DIR`.
 
 Says what is wrong in one line, with exit code 2; stops with 130 after Ctrl-C and with 143 after SIGTERM. What is slow
 to import is imported when a command runs, so that `--help` answers at once.
 """
 
 import importlib.metadata
-from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
@@ -13,8 +12,7 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 import gym_dgpmpc  # noqa: F401  # registers the environments
-from gym_dgpmpc.bench.report_command import report
-from gym_dgpmpc.cli import bench, evaluate, train
+from gym_dgpmpc.cli import benchmarks, evaluate, train
 
 
 def _train() -> None:
@@ -22,14 +20,6 @@ def _train() -> None:
 
 
 _train.__doc__ = train.train.__doc__
-
-COMMANDS: dict[str, Callable[..., None]] = {
-    "train": _train,
-    "evaluate": evaluate.evaluate,
-    "bench": bench.bench,
-    "report": report,
-}
-"""In the order in which `dgpmpc --help` shows them."""
 
 
 class _Commands(TyperGroup):
@@ -64,5 +54,7 @@ def main(
     """Sample-efficient model-predictive control with deep Gaussian processes."""
 
 
-for name, command in COMMANDS.items():
-    app.command(name)(command)
+# In the order in which `dgpmpc --help` shows them.
+app.command("train")(_train)
+app.command()(evaluate.evaluate)
+benchmarks.add_benchmarks(app)

@@ -49,8 +49,6 @@ def distance(observation, action, next_observation):
     return -next_observation[..., 0].abs()
 
 
-
-
 def a_task(reward_fn):
     observations = spaces.Box(-9.0, 9.0, (1,))
     return Task(None, observations, SPACE, TaskArguments(reward_fn, None, None), torch.device("cpu"))

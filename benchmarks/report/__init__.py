@@ -1,0 +1,1 @@
+"""Tables and figures from result files of runs: `pages` makes a report, the other modules its parts."""

@@ -1,0 +1,64 @@
+"""The tasks of the benchmarks: an environment, and the arguments that it and its agents get."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task, as plain data, so that it can be sent to another machine.
+
+    Attributes:
+        name: the environment's id; what was changed about it, if anything, after a colon.
+        episode_steps: steps after which an episode is truncated.
+        env_id: id for `gymnasium.make`; "" stands for the name up to the colon.
+        presets_of: the environment whose presets it has; "" stands for the name up to the colon.
+        arguments: arguments of the environment.
+        for_planning: arguments of agents that plan with a model.
+        for_model_free: further arguments of the environment for agents without a model.
+    """
+
+    name: str
+    episode_steps: int
+    env_id: str = ""
+    presets_of: str = ""
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    for_planning: Mapping[str, Any] = field(default_factory=dict)
+    for_model_free: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def preset(self) -> str:
+        """The key of its presets."""
+        return self.presets_of or self.name.partition(":")[0]
+
+    def make(self, *, model_free: bool = False) -> gymnasium.Env:
+        """The environment, for an agent of one kind or the other."""
+        env_id = self.env_id or self.name.partition(":")[0]
+        return gymnasium.make(env_id, **self.arguments, **(self.for_model_free if model_free else {}))
+
+
+LEARNED_REWARD = {"reward_fn": "learned"}
+
+ALL_TASKS = (
+    Task("ModCartPole-v0", 200),
+    Task("SwingUpCartPole-v0", 200),
+    Task("BiasedReacher-v0", 150),
+    Task("Reacher7DoF-v0", 150),
+    # Agents without a model see the risk in the returned reward alone; results hold the task's own reward all the same.
+    Task("RiskSensitiveHalfCheetah-v0", 1000, for_model_free={"penalise_step": True}),
+    Task("RiskSensitiveHalfCheetah-v0:50 episodes", 1000, for_model_free={"penalise_step": True}),
+    Task("VelocityHalfCheetah-v0", 1000),
+    Task("Pendulum-v1", 200),
+    Task("Pendulum-v1:learned reward", 200, for_planning=LEARNED_REWARD),
+    Task("InvertedPendulum-v5", 1000),
+    Task("InvertedDoublePendulum-v5", 1000),
+    Task("Reacher-v5", 50),
+    Task("Swimmer-v5", 1000),
+    Task("FetchReachDense-v4", 50, env_id="gym_dgpmpc.envs.robotics:FetchReachDense-v4"),
+)
+
+TASKS: Mapping[str, Task] = {task.name: task for task in ALL_TASKS}
+"""All tasks by name."""

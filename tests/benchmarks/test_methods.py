@@ -1,0 +1,66 @@
+"""Baselines are set as the work that they stand for has them, and as the comparison of the paper plans."""
+
+import inspect
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.noise import NormalActionNoise
+
+from benchmarks.methods import METHODS
+from benchmarks.tasks import TASKS
+
+PAPER = {"ModCartPole-v0": 200, "BiasedReacher-v0": 150, "RiskSensitiveHalfCheetah-v0": 1000}
+"""Steps of an episode."""
+
+
+def unlike_the_library(name, algorithm, task):
+    """The settings that are not the defaults of Stable-Baselines3."""
+    defaults = {p.name: p.default for p in inspect.signature(algorithm).parameters.values()}
+    settings = METHODS[name].settings(TASKS[task])
+    return {key: value for key, value in settings.items() if key not in defaults or value != defaults[key]}
+
+
+@pytest.mark.parametrize(("task", "steps"), PAPER.items())
+def test_methods_without_a_model_have_the_librarys_settings_but_for_these(task, steps):
+    env_arguments = {"penalise_step": True} if "HalfCheetah" in task else {}
+    assert unlike_the_library("SAC", SAC, task) == {"learning_starts": steps, **env_arguments}
+    assert unlike_the_library("TD3", TD3, task) == {"learning_starts": steps, "exploration_noise": 0.1, **env_arguments}
+    assert unlike_the_library("PPO", PPO, task) == {"n_steps": steps, "batch_size": 50, **env_arguments}
+
+
+def test_on_other_tasks_they_begin_as_the_library_does():
+    assert unlike_the_library("SAC", SAC, "Pendulum-v1") == {}
+    assert unlike_the_library("TD3", TD3, "Pendulum-v1") == {"exploration_noise": 0.1}
+
+
+def test_td3_explores_with_the_noise_of_its_authors():
+    """Fujimoto et al. (2018): N(0, 0.1), in half the width of the action range."""
+    task = TASKS["BiasedReacher-v0"]
+    env = task.make(model_free=True)
+    model = METHODS["TD3"].make(env, METHODS["TD3"].settings(task), seed=0)
+    assert isinstance(model.action_noise, NormalActionNoise)
+    np.random.seed(0)  # noqa: NPY002  # the library's noise draws from there
+    draws = np.array([model.action_noise() for _ in range(2000)])
+    env.close()
+    assert draws.shape == (2000, 7)
+    # Five standard errors of a mean and of a deviation.
+    np.testing.assert_allclose(draws.mean(axis=0), 0.0, atol=5 * 0.1 / np.sqrt(len(draws)))
+    np.testing.assert_allclose(draws.std(axis=0), 0.1, rtol=5 / np.sqrt(2 * len(draws)))
+
+
+@pytest.mark.parametrize("task", PAPER)
+@pytest.mark.parametrize(
+    ("name", "draw"), [("PETS TS1", "TS1"), ("PETS TSinf", "TSinf"), ("PETS as published", "TSinf")]
+)
+def test_pets_trains_as_published(name, draw, task):
+    found = METHODS[name].settings(TASKS[task])
+    wanted = {"draw": draw, "num_members": 5, "batch_size": 32, "num_epochs": 5, "half_precision": True}
+    assert {key: found[key] for key in wanted} == wanted
+
+
+@pytest.mark.parametrize("task", PAPER)
+@pytest.mark.parametrize("draw", ["MM", "DS"])
+def test_gps_have_the_papers_inducing_points(draw, task):
+    found = METHODS[f"GP-{draw}"].settings(TASKS[task])
+    assert (found["draw"], found["num_inducing"]) == (draw, 200)
