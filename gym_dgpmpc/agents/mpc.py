@@ -2,16 +2,15 @@
 
 Learning is Algorithm 2 of Gadd et al. (2020), "Sample-Efficient Reinforcement Learning using Deep Gaussian
 Processes"; it stands in one function, `MPCAgent._control`. The agent *has* a task (what to do, what to predict), a
-controller (model and planner) and a collector (the running episodes); `arguments.py` reads how it was made.
+controller (model and planner) and a collector (the running episodes); `composition.py` knows what it
+is made of.
 """
 
-import inspect
 import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
@@ -26,18 +25,20 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 from stable_baselines3.common.vec_env import VecEnv
 
-from gym_dgpmpc.agents.arguments import (
-    AGENT,
-    UNSET,
-    PlanningArguments,
-    called_in_order,
-    composed_documentation,
-    composed_signature,
-)
 from gym_dgpmpc.agents.collector import Collector
+from gym_dgpmpc.agents.composition import (
+    AnyPlanner,
+    Composition,
+    MadeOf,
+    PlanningArguments,
+    own_settings,
+    part_settings,
+)
 from gym_dgpmpc.agents.episode import EpisodeRecord
 from gym_dgpmpc.agents.logs import Logs
 from gym_dgpmpc.agents.policy import MPCPolicy
+from gym_dgpmpc.agents.progress import Progress, RandomStreams
+from gym_dgpmpc.agents.signature import UNSET, called_in_order, composed_documentation, composed_signature
 from gym_dgpmpc.checkpoints.collect import collect
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.checkpoints.format import CheckpointPath, write_checkpoint
@@ -46,12 +47,12 @@ from gym_dgpmpc.checkpoints.restore import load_agent
 from gym_dgpmpc.checkpoints.safeguard import Guard, safeguard
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.transitions import TransitionStore
-from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError, ReliabilityWarning
+from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.plan_state import PackedPlans
-from gym_dgpmpc.planning.registry import is_ready_made, make_planner, planner_factory
-from gym_dgpmpc.randomness import Generators, derive_seed, fresh_seed, split_seed
-from gym_dgpmpc.settings import Setting, joined, refuse_unknown, settings_of
+from gym_dgpmpc.planning.registry import planner_factory
+from gym_dgpmpc.randomness import Generators, fresh_seed, split_seed
+from gym_dgpmpc.settings import Setting, joined, settings_of
 from gym_dgpmpc.tasks.dict_observations import FlatDict, original_space
 from gym_dgpmpc.tasks.environment import flat_size, wrapped_env
 from gym_dgpmpc.tasks.exported import arrays, minari_dataset, replay_buffer
@@ -75,9 +76,6 @@ SelfAgent = TypeVar("SelfAgent", bound="MPCAgent")
 
 ENDLESS = 1000
 """Random steps after which a warning says that no episode has ended. Gymnasium's own tasks have at most as many."""
-
-LARGEST_COUNT = 1 << 53
-"""What a file may claim of a counter."""
 
 
 class MPCAgent(BaseAlgorithm):
@@ -184,8 +182,9 @@ class MPCAgent(BaseAlgorithm):
         policy, env, dynamics, planner = called_in_order(type(self).__name__, args, policy, env, dynamics, planner)
         optional = {"learning_starts": learning_starts, "train_freq": train_freq}
         check_counts(**{name: count for name, count in optional.items() if count is not None})
-        self._planner_given = "cem" if planner is None else planner
-        self.settings = self._complete(settings, self._planner_given, dynamics)
+        self.composition = Composition(
+            self.made_of(), dynamics, "cem" if planner is None else planner, settings, self.own_settings()
+        )
         if env is not None:
             env = wrapped_env(env)
         super().__init__(
@@ -203,7 +202,6 @@ class MPCAgent(BaseAlgorithm):
         self.learning_starts, self.train_freq = learning_starts, train_freq
         self._task_given = TaskArguments(reward_fn, terminated_fn, observation_spec)
         self._planning_given = PlanningArguments(num_particles, actions_per_plan, time_budget)
-        self._dynamics_given = dynamics
         self.seeds_environment = seed is not None
         self.seed = fresh_seed() if seed is None else seed
         if _init_setup_model:
@@ -214,46 +212,37 @@ class MPCAgent(BaseAlgorithm):
     # ------------------------------------------------------------------------------------------ what it is made of
 
     @classmethod
-    def own_settings(cls) -> dict[str, Setting]:
-        """The settings that every agent has, whatever it is made of."""
-        own = settings_of(MPCAgent)
-        changed = inspect.signature(cls.__init__).parameters  # a named agent may have another default
-        return {
-            name: replace(own[name], default=changed[name].default if name in changed else own[name].default)
-            for name in AGENT
-        }
+    def made_of(cls) -> MadeOf:
+        """What this class says of its parts."""
+        return MadeOf(cls.__name__, cls.dynamics_class, cls.planner_defaults)
 
     @classmethod
-    def part_settings(cls, planner: str | PlannerFactory | Planner) -> dict[str, Setting]:
+    def own_settings(cls) -> dict[str, Setting]:
+        """The settings that every agent has, whatever it is made of."""
+        return own_settings(MPCAgent, cls)
+
+    @classmethod
+    def part_settings(cls, planner: AnyPlanner = "cem") -> dict[str, Setting]:
         """The settings of the model, and of the planner unless it is a ready-made one."""
-        of_model = {} if cls.dynamics_class is None else settings_of(cls.dynamics_class)
-        of_planner = {} if is_ready_made(planner) else settings_of(planner_factory(planner))
-        return joined(of_model, of_planner)
+        return part_settings(cls.made_of(), planner)
 
-    def _complete(self, settings: dict[str, Any], planner: Any, dynamics: Any) -> Mapping[str, Any]:
-        """Every setting of model and planner, the defaults where none is given."""
-        name, known = type(self).__name__, self.part_settings(planner)
-        if self.dynamics_class is not None and dynamics is not None:
-            raise TypeError(f"a {name} makes its own dynamics model: MPCAgent takes any, got dynamics={dynamics!r}")
-        refuse_unknown(name, settings, {**known, **self.own_settings()})
-        defaults = {each.name: each.default for each in known.values()}
-        defaults |= {each: value for each, value in self.planner_defaults.items() if each in known}
-        return MappingProxyType({**defaults, **settings})
+    @classmethod
+    def saved_settings(cls, planner: AnyPlanner) -> dict[str, Setting]:
+        """The constructor arguments that a file holds, of an agent with this planner."""
+        together = joined(cls.own_settings(), cls.part_settings(planner))
+        return {name: setting for name, setting in together.items() if setting.is_saved}
 
-    def _setting(self, name: str) -> Any:
-        if name not in self.settings:
-            raise AttributeError(f"this agent's planner has no setting {name!r}; there are {sorted(self.settings)}")
-        return self.settings[name]
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Every setting of model and planner; each can be read as an attribute too, and none can be changed."""
+        return self.composition.settings
 
     def _setup_model(self) -> None:
         """Create what an untrained agent has, once the spaces are known."""
         self.store = TransitionStore(flat_size(self.observation_space), flat_size(self.action_space))
         self.generators: Generators = split_seed(self.seed, self.device)
         self.task = Task(self.env, self.observation_space, self.action_space, self._task_given, self.device)
-        of_planner = set(self.part_settings(self._planner_given)) - set(self._model_settings())
-        planner = make_planner(
-            self._planner_given, self.action_space, self.device, **{name: self.settings[name] for name in of_planner}
-        )
+        planner = self.composition.make_planner(self.action_space, self.device)
         self.num_fitted = 0  # transitions that the last training saw
         self.controller = Controller(
             self._new_dynamics(), planner, self.action_space, *self._planning_given, device=self.device
@@ -265,24 +254,11 @@ class MPCAgent(BaseAlgorithm):
         self._has_described = False  # whether it was said where reward and termination come from
         self._warned: set[str] = set()
 
-    def _model_settings(self) -> dict[str, Any]:
-        names = () if self.dynamics_class is None else settings_of(self.dynamics_class)
-        return {name: self.settings[name] for name in names}
-
     def _make_dynamics(
         self, observation_size: int, action_size: int, observation_spec: ObservationSpec
     ) -> DynamicsModel | None:
         """An untrained model of such transitions, or None if the agent was given a ready-made one."""
-        if self.dynamics_class is not None:
-            return self.dynamics_class(
-                observation_size, action_size, observation_spec, **self._model_settings(), device=self.device
-            )
-        given = self._dynamics_given
-        if isinstance(given, DynamicsModel) and not isinstance(given, type):  # a class makes models
-            return None
-        if given is None:
-            raise ValueError("an MPCAgent is made of a dynamics model and a planner: pass dynamics=...")
-        return given(observation_size, action_size, observation_spec)
+        return self.composition.make_dynamics(observation_size, action_size, observation_spec, self.device)
 
     def _new_dynamics(self) -> DynamicsModel:
         """An untrained model of what the task wants predicted; the ready-made one, if the agent was given one.
@@ -297,8 +273,8 @@ class MPCAgent(BaseAlgorithm):
             return made
         if modelled.reward or modelled.terminated:
             raise self.task.unknown_reward()
-        assert isinstance(self._dynamics_given, DynamicsModel)
-        return self._dynamics_given
+        assert isinstance(self.composition.dynamics, DynamicsModel)
+        return self.composition.dynamics
 
     def _model_anew(self, *, reward: bool, terminated: bool) -> None:
         """Begin with an untrained model, of the observation and what else it is to predict."""
@@ -861,22 +837,11 @@ class MPCAgent(BaseAlgorithm):
         """
         raise NotImplementedError(f"to take over what another agent has learned use {type(self).__name__}.load(path)")
 
-    @classmethod
-    def saved_settings(cls, planner: str | PlannerFactory | Planner) -> dict[str, Setting]:
-        """The constructor arguments that a file holds, of an agent with this planner."""
-        together = joined(cls.own_settings(), cls.part_settings(planner))
-        return {name: setting for name, setting in together.items() if setting.is_saved}
-
-    @property
-    def planner_name(self) -> str | None:
-        """The registered name that the planner was given by; None if it was given as a class or an object."""
-        return self._planner_given if isinstance(self._planner_given, str) else None
-
     def arguments(self) -> dict[str, Any]:
         """The constructor arguments as they are now, those that a file holds."""
         own = {name: getattr(self, name) for name in self.own_settings()}
-        saved = self.saved_settings(self._planner_given)
-        return {"planner": self.planner_name} | {name: {**self.settings, **own}[name] for name in saved}
+        saved = self.saved_settings(self.composition.planner)
+        return {"planner": self.composition.planner_name} | {name: {**self.settings, **own}[name] for name in saved}
 
     def nouns(self) -> dict[str, Stateful]:
         """What a checkpoint holds, in the order in which it is restored; each knows its own fields."""
@@ -884,8 +849,8 @@ class MPCAgent(BaseAlgorithm):
             "task": StateOf(self.task.state_dict, self._load_task),
             "dynamics": self.dynamics,
             "transitions": self.store,
-            "progress": StateOf(self._progress, self._load_progress),
-            "random": StateOf(self._random, self._load_random),
+            "progress": Progress(self),
+            "random": RandomStreams(self),
             "logs": self.logs,
             "episodes": self.collector,
         }
@@ -896,55 +861,16 @@ class MPCAgent(BaseAlgorithm):
         if self.task.modelled != before:
             self.controller.dynamics = self._new_dynamics()
 
-    def _progress(self) -> StateDict:
-        """Counters, and where the environments are if an episode is running in them."""
-        state: StateDict = {"num_timesteps": self.num_timesteps, "num_fitted": self.num_fitted}
-        state["num_episodes"] = self._episode_num
-        if self._last_obs is not None:
-            state["last_observation"] = torch.tensor(self._last_obs)
-            state["last_episode_starts"] = torch.tensor(self._last_episode_starts)
-        return state
-
-    def _load_progress(self, state: StateDict) -> None:
-        counts = {name: state[name] for name in ("num_timesteps", "num_fitted", "num_episodes")}
-        for name, count in counts.items():
-            if not isinstance(count, int) or isinstance(count, bool) or not 0 <= count <= LARGEST_COUNT:
-                raise ValueError(f"{name} must be a count from 0 to {LARGEST_COUNT}, got {count!r}")
-        self.num_timesteps, self.num_fitted, self._episode_num = counts.values()
-        self._last_obs = None
-        if "last_observation" in state and len(state["last_observation"]) == self.n_envs:
-            self.begin_at(state["last_observation"].numpy(), state["last_episode_starts"].numpy())
-
     def begin_at(self, observation: np.ndarray | None, episode_starts: np.ndarray | None = None) -> None:
         """Let `learn` go on from these observations [n, S]; None lets it begin new episodes."""
         self._last_obs = observation
         if observation is not None:
             self._last_episode_starts = episode_starts
 
-    def _random(self) -> StateDict:
-        """The random streams, which belong to a kind of device."""
-        return {
-            "device": self.device.type, "seeds_environment": self.seeds_environment, **self.generators.state_dict()
-        }  # fmt: skip
-
-    def _load_random(self, state: StateDict) -> None:
-        self.seeds_environment = bool(state["seeds_environment"])
-        saved_on, device = state.get("device", self.device.type), self.device.type
-        if saved_on == device:
-            self.generators.load_state_dict(state)
-            return
-        warnings.warn(
-            f"the agent was saved on the device {saved_on!r}, whose random numbers {device!r} cannot go on with: it "
-            "begins new ones, and goes on otherwise than it would have there",
-            ReliabilityWarning,
-            stacklevel=2,
-        )
-        self.generators = split_seed(derive_seed(self.seed, "other_device", self.num_timesteps), self.device)
-
 
 def _property(name: str) -> property:
     """A setting, to be read on the agent; it is decided when the agent is made."""
-    return property(lambda agent: agent._setting(name))
+    return property(lambda agent: agent.composition.setting(name))
 
 
 def _as_callbacks(callback: MaybeCallback) -> list[BaseCallback]:

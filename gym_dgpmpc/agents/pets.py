@@ -36,7 +36,11 @@ class PETSAgent(MPCAgent):
     def _make_dynamics(
         self, observation_size: int, action_size: int, observation_spec: ObservationSpec
     ) -> DynamicsModel | None:
-        draw, members, particles = *map(self._setting, ("draw", "num_members")), self._planning_given.num_particles
+        draw, members, particles = (
+            self.settings["draw"],
+            self.settings["num_members"],
+            self._planning_given.num_particles,
+        )
         if draw in ("TS1", "TSinf") and particles % members:
             raise ValueError(
                 f"the draw {draw} needs a multiple of num_members = {members} as num_particles, got {particles}"

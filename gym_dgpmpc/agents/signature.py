@@ -6,7 +6,7 @@
 import inspect
 import textwrap
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 from stable_baselines3.common.policies import BasePolicy
@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from gym_dgpmpc.settings import Setting, Settings, argument_texts, joined
 
-AGENT = (
+PLAIN = (
     "num_particles",
     "actions_per_plan",
     "learning_starts",
@@ -27,14 +27,6 @@ AGENT = (
     "seed",
 )
 """The arguments of every agent that are plain values, each an attribute too: what a file holds beside the parts'."""
-
-
-class PlanningArguments(NamedTuple):
-    """What the controller is made with; from then on it owns them."""
-
-    num_particles: int
-    actions_per_plan: int
-    time_budget: float | None
 
 
 NOT_PLAIN = ("planner", "reward_fn", "terminated_fn", "device")

@@ -1,0 +1,146 @@
+"""What an agent is made of: a dynamics model and a planner, each with the settings that its own class documents.
+
+`MPCAgent` keeps a `Composition` of what it was asked for; `signature.py` shows the same to `help` and to callers.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import torch
+from gymnasium import spaces
+
+from gym_dgpmpc.agents.signature import PLAIN
+from gym_dgpmpc.planning.registry import is_ready_made, make_planner, planner_factory
+from gym_dgpmpc.settings import Setting, joined, refuse_unknown, settings_of
+from gym_dgpmpc.types import DynamicsFactory, DynamicsModel, ObservationSpec, Planner, PlannerFactory
+
+AnyPlanner = str | PlannerFactory | Planner
+"""A planner by name, by what makes it, or ready-made."""
+
+
+class PlanningArguments(NamedTuple):
+    """What the controller is made with; from then on it owns them."""
+
+    num_particles: int
+    actions_per_plan: int
+    time_budget: float | None
+
+
+class MadeOf(NamedTuple):
+    """What a class of agents says of its parts.
+
+    Attributes:
+        name: of the class.
+        dynamics_class: the model that it makes, or None if it is given one.
+        planner_defaults: the planner's settings that differ from the planner's own defaults.
+    """
+
+    name: str
+    dynamics_class: Callable[..., DynamicsModel] | None
+    planner_defaults: Mapping[str, Any]
+
+
+def own_settings(base: Callable[..., Any], agent: type) -> dict[str, Setting]:
+    """The settings that every agent has, whatever it is made of, with the defaults of one class of agents.
+
+    Args:
+        base: `MPCAgent`, which documents them.
+        agent: the class.
+    """
+    own = settings_of(base)
+    changed = inspect.signature(agent.__init__).parameters  # type: ignore[misc]
+    return {
+        name: replace(own[name], default=changed[name].default if name in changed else own[name].default)
+        for name in PLAIN
+    }
+
+
+def part_settings(agent: MadeOf, planner: AnyPlanner) -> dict[str, Setting]:
+    """The settings of an agent's model, and of its planner unless that is a ready-made one."""
+    of_planner = {} if is_ready_made(planner) else settings_of(planner_factory(planner))
+    return joined(model_settings(agent), of_planner)
+
+
+def model_settings(agent: MadeOf) -> dict[str, Setting]:
+    """The settings of the model that a named agent makes; none of a plain `MPCAgent`."""
+    return {} if agent.dynamics_class is None else settings_of(agent.dynamics_class)
+
+
+class Composition:
+    """How one agent is made.
+
+    Args:
+        agent: what its class says.
+        dynamics, planner: as they were given to it.
+        settings: those of model and planner that were given.
+        other_names: arguments that are no settings of these two, for the error.
+
+    Attributes:
+        settings: every setting of model and planner, the defaults where none was given; fixed from then on.
+
+    Raises:
+        TypeError: there is no such setting; or a model was given to an agent that makes its own.
+    """
+
+    def __init__(
+        self,
+        agent: MadeOf,
+        dynamics: DynamicsModel | DynamicsFactory | None,
+        planner: AnyPlanner,
+        settings: Mapping[str, Any],
+        other_names: Mapping[str, Setting],
+    ):
+        self._agent, self.dynamics, self.planner = agent, dynamics, planner
+        if agent.dynamics_class is not None and dynamics is not None:
+            raise TypeError(
+                f"a {agent.name} makes its own dynamics model: MPCAgent takes any, got dynamics={dynamics!r}"
+            )
+        known = part_settings(agent, planner)
+        refuse_unknown(agent.name, settings, {**known, **other_names})
+        defaults = {name: agent.planner_defaults.get(name, setting.default) for name, setting in known.items()}
+        self.settings: Mapping[str, Any] = MappingProxyType({**defaults, **settings})
+
+    @property
+    def planner_name(self) -> str | None:
+        """The registered name that the planner was given by; None if it was given as a class or an object."""
+        return self.planner if isinstance(self.planner, str) else None
+
+    def setting(self, name: str) -> Any:
+        """One of ``settings``.
+
+        Raises:
+            AttributeError: this agent has no such setting, because its planner is another one.
+        """
+        if name not in self.settings:
+            raise AttributeError(f"this agent's planner has no setting {name!r}; there are {sorted(self.settings)}")
+        return self.settings[name]
+
+    def make_planner(self, action_space: spaces.Box, device: torch.device) -> Planner:
+        """The planner, for these actions.
+
+        Raises:
+            ValueError, TypeError: see `registry.make_planner`.
+        """
+        of_model = model_settings(self._agent)
+        own = {name: value for name, value in self.settings.items() if name not in of_model}
+        return make_planner(self.planner, action_space, device, **own)
+
+    def make_dynamics(
+        self, observation_size: int, action_size: int, observation_spec: ObservationSpec, device: torch.device
+    ) -> DynamicsModel | None:
+        """An untrained model of such transitions, or None if the agent was given a ready-made one.
+
+        Raises:
+            ValueError: nothing was given to make one of, or a setting is out of its range.
+        """
+        if self._agent.dynamics_class is not None:
+            own = {name: self.settings[name] for name in model_settings(self._agent)}
+            return self._agent.dynamics_class(observation_size, action_size, observation_spec, **own, device=device)
+        if self.dynamics is None:
+            raise ValueError("an MPCAgent is made of a dynamics model and a planner: pass dynamics=... and planner=...")
+        if isinstance(self.dynamics, DynamicsModel) and not isinstance(self.dynamics, type):  # a class makes models
+            return None
+        return self.dynamics(observation_size, action_size, observation_spec)

@@ -1,0 +1,80 @@
+"""How far an agent has come, and where its random streams are: what a checkpoint keeps of the algorithm itself."""
+
+import warnings
+from typing import TYPE_CHECKING
+
+import torch
+
+from gym_dgpmpc.errors import ReliabilityWarning
+from gym_dgpmpc.randomness import derive_seed, split_seed
+from gym_dgpmpc.types import StateDict
+
+if TYPE_CHECKING:
+    from gym_dgpmpc.agents.mpc import MPCAgent
+
+LARGEST_COUNT = 1 << 53
+"""What a file may claim of a counter."""
+
+
+class Progress:
+    """The counters of an agent, and the present observations if episodes are running."""
+
+    def __init__(self, agent: "MPCAgent"):
+        self._agent = agent
+
+    def state_dict(self) -> StateDict:
+        agent = self._agent
+        state: StateDict = {"num_timesteps": agent.num_timesteps, "num_fitted": agent.num_fitted}
+        state["num_episodes"] = agent._episode_num
+        if agent._last_obs is not None:
+            state["last_observation"] = torch.tensor(agent._last_obs)
+            state["last_episode_starts"] = torch.tensor(agent._last_episode_starts)
+        return state
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Go on from `state_dict`; with another number of environments, new episodes begin.
+
+        Raises:
+            KeyError, ValueError: a counter is missing or out of its range.
+        """
+        agent = self._agent
+        counts = {name: state[name] for name in ("num_timesteps", "num_fitted", "num_episodes")}
+        for name, count in counts.items():
+            if not isinstance(count, int) or isinstance(count, bool) or not 0 <= count <= LARGEST_COUNT:
+                raise ValueError(f"{name} must be a count from 0 to {LARGEST_COUNT}, got {count!r}")
+        agent.num_timesteps, agent.num_fitted, agent._episode_num = counts.values()
+        agent.begin_at(None)
+        if "last_observation" in state and len(state["last_observation"]) == agent.n_envs:
+            agent.begin_at(state["last_observation"].numpy(), state["last_episode_starts"].numpy())
+
+
+class RandomStreams:
+    """The generators of an agent, which belong to a kind of device, and whether its seed is the environment's too."""
+
+    def __init__(self, agent: "MPCAgent"):
+        self._agent = agent
+
+    def state_dict(self) -> StateDict:
+        agent = self._agent
+        about = {"device": agent.device.type, "seeds_environment": agent.seeds_environment}
+        return {**about, **agent.generators.state_dict()}
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Go on from `state_dict`; on another kind of device with new streams that the seed decides, and a warning.
+
+        Raises:
+            KeyError, RuntimeError: see `Generators.load_state_dict`.
+        """
+        agent = self._agent
+        agent.seeds_environment = bool(state["seeds_environment"])
+        saved_on, device = state.get("device", agent.device.type), agent.device.type
+        if saved_on == device:
+            agent.generators.load_state_dict(state)
+            return
+        warnings.warn(
+            f"the agent was saved on the device {saved_on!r}, whose random numbers {device!r} cannot go on with: it "
+            "begins new ones, and goes on otherwise than it would have there",
+            ReliabilityWarning,
+            stacklevel=2,
+        )
+        agent.generators = split_seed(derive_seed(agent.seed, "other_device", agent.num_timesteps), agent.device)
