@@ -20,7 +20,8 @@ from benchmarks.tasks import Task
 from gym_dgpmpc.agents import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent, presets
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.gp.kernels import KERNELS
-from gym_dgpmpc.planning import make_planner
+from gym_dgpmpc.planning import planner_factory
+from gym_dgpmpc.settings import settings_of
 
 NO_SETTINGS = {
     "env",
@@ -48,6 +49,8 @@ Presets = Callable[[Task], Mapping[str, Any]]
 class PlanningMethod:
     """A method that learns a model and plans with it, or plans with the true one.
 
+    It plans by CEM unless ``planner="..."`` is asked for; then the settings of CEM give way to those of that planner.
+
     Attributes:
         name: its name in a report.
         make_agent: an agent's class, or a function with the same arguments.
@@ -69,7 +72,13 @@ class PlanningMethod:
             ValueError: the agent has no argument of a name that is asked for.
         """
         given = {**self.presets(task), **self.fixed, **task.for_planning}
-        return _complete(self.name, _defaults(self.make_agent), given, asked)
+        defaults, planner = _defaults(self.make_agent), asked.get("planner", "cem")
+        if planner != "cem":
+            mine, cems = settings_of(planner_factory(planner)), settings_of(planner_factory("cem"))
+            given = {name: value for name, value in given.items() if name in mine or name not in cems}
+            defaults = {name: value for name, value in defaults.items() if name not in cems}
+            defaults |= {name: setting.default for name, setting in mine.items()}
+        return _complete(self.name, defaults, given, asked)
 
     def make(self, env: gymnasium.Env, settings: Settings, seed: int, **arguments: Any) -> MPCAgent:
         """Make the agent; ``arguments`` are those that are not settings."""
@@ -138,19 +147,13 @@ def true_dynamics_agent(
     Raises:
         ValueError: the environment's simulator cannot be used; see `Simulator`.
     """
-    assert isinstance(env.action_space, spaces.Box)
-    planner = make_planner(
-        "cem",
-        env.action_space,
+    return MPCAgent(
+        env,
+        TrueDynamics(env),
         horizon=horizon,
         num_candidates=num_candidates,
         num_elites=num_elites,
         num_iterations=num_iterations,
-    )
-    return MPCAgent(
-        env,
-        TrueDynamics(env),
-        planner,
         num_particles=1,
         actions_per_plan=actions_per_plan,
         learning_starts=learning_starts,

@@ -6,6 +6,8 @@ from typing import Any
 
 import gymnasium
 
+from gym_dgpmpc.envs.registration import ENVIRONMENTS
+
 
 @dataclass(frozen=True)
 class Task:
@@ -42,15 +44,18 @@ class Task:
 
 LEARNED_REWARD = {"reward_fn": "learned"}
 
+FOR_MODEL_FREE: Mapping[str, Mapping[str, Any]] = {"RiskSensitiveHalfCheetah-v0": {"penalise_step": True}}
+"""Agents without a model see the risk in the returned reward alone; results hold the task's own reward all the same."""
+
+
+def _shipped(env_id: str, change: str = "") -> Task:
+    """One of the package's environments; ``change`` says what is different about it."""
+    return Task(env_id + change, ENVIRONMENTS[env_id][1], for_model_free=FOR_MODEL_FREE.get(env_id, {}))
+
+
 ALL_TASKS = (
-    Task("ModCartPole-v0", 200),
-    Task("SwingUpCartPole-v0", 200),
-    Task("BiasedReacher-v0", 150),
-    Task("Reacher7DoF-v0", 150),
-    # Agents without a model see the risk in the returned reward alone; results hold the task's own reward all the same.
-    Task("RiskSensitiveHalfCheetah-v0", 1000, for_model_free={"penalise_step": True}),
-    Task("RiskSensitiveHalfCheetah-v0:50 episodes", 1000, for_model_free={"penalise_step": True}),
-    Task("VelocityHalfCheetah-v0", 1000),
+    *map(_shipped, ENVIRONMENTS),
+    _shipped("RiskSensitiveHalfCheetah-v0", ":50 episodes"),
     Task("Pendulum-v1", 200),
     Task("Pendulum-v1:learned reward", 200, for_planning=LEARNED_REWARD),
     Task("InvertedPendulum-v5", 1000),

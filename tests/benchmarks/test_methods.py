@@ -9,6 +9,8 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from benchmarks.methods import METHODS
 from benchmarks.tasks import TASKS
+from gym_dgpmpc.planning import PLANNERS
+from tests.planning.toy_planners import RandomShooting
 
 PAPER = {"ModCartPole-v0": 200, "BiasedReacher-v0": 150, "RiskSensitiveHalfCheetah-v0": 1000}
 """Steps of an episode."""
@@ -64,3 +66,17 @@ def test_pets_trains_as_published(name, draw, task):
 def test_gps_have_the_papers_inducing_points(draw, task):
     found = METHODS[f"GP-{draw}"].settings(TASKS[task])
     assert (found["draw"], found["num_inducing"]) == (draw, 200)
+
+
+def test_a_planner_brings_its_own_settings(monkeypatch):
+    monkeypatch.setitem(PLANNERS, "random-shooting", RandomShooting)
+    method, task = METHODS["DGP-MPC L=2 matern32"], TASKS["ModCartPole-v0"]
+    found = method.settings(task, planner="random-shooting", num_candidates=20)
+    assert {name: found[name] for name in ("planner", "horizon", "num_candidates")} == {
+        "planner": "random-shooting", "horizon": 30, "num_candidates": 20,
+    }  # fmt: skip
+    assert set(method.settings(task)) - set(found) == {"num_elites", "num_iterations", "smoothing", "min_std"}
+    env = task.make()
+    agent = method.make(env, found, seed=0)
+    env.close()
+    assert isinstance(agent.planner, RandomShooting) and agent.planner.num_candidates == 20
