@@ -1,4 +1,4 @@
-"""Learn the modified cart-pole, evaluate, save and load: the README's script with a few knobs.
+"""Learn the modified cart-pole, evaluate, save and load: the script of docs/using.md with a few knobs.
 
 python examples/quickstart.py                 # ten episodes, about ten minutes on one core
 python examples/quickstart.py --steps 600     # the random episode and two planned ones

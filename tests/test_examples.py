@@ -1,5 +1,6 @@
 """The examples run, at a tiny size."""
 
+import functools
 import math
 import re
 from pathlib import Path
@@ -10,6 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from examples import own_task, quickstart
+from gym_dgpmpc import DGPMPCAgent
 
 ROOT = Path(own_task.__file__).parents[1]
 TINY = {
@@ -44,9 +46,26 @@ def test_own_task():
     assert (low >= 0).all() and (high <= 1).all() and (high > low).all()
 
 
-def test_the_readmes_other_agents_can_be_made_as_it_says():
+def python_of(page):
+    """The Python of a page, block by block."""
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)
+
+
+def test_the_readmes_lines_run(tmp_path, monkeypatch):
+    """With settings that take no time: what the lines name is there, and is called as they call it."""
+    (code,) = python_of("README.md")
+    assert len([line for line in code.splitlines() if line]) <= 6
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gym_dgpmpc.DGPMPCAgent", functools.partial(DGPMPCAgent, **TINY), raising=False)
+    namespace = {}
+    exec(code.replace("total_timesteps=1_400", "total_timesteps=30"), namespace)
+    assert namespace["agent"].num_timesteps == 30
+    assert namespace["env"].action_space.contains(namespace["action"])
+
+
+def test_the_other_agents_can_be_made_as_the_pages_say():
     namespace = {"env": gymnasium.make("gym_dgpmpc:ModCartPole-v0")}
-    learning, *others = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    learning, *others = python_of("docs/using.md")
     assert "agent.learn(" in learning  # for minutes; `test_quickstart` does the same in less
     for code in others:
         exec(code, namespace)

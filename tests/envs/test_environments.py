@@ -14,19 +14,14 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
+from gym_dgpmpc import envs
 from gym_dgpmpc.data.encoding import Encoder
-from gym_dgpmpc.envs import (
-    BiasedReacherEnv,
-    ModCartPoleEnv,
-    Reacher7DoFEnv,
-    SwingUpCartPoleEnv,
-    VelocityHalfCheetahEnv,
-)
+from gym_dgpmpc.envs import ModCartPoleEnv, Reacher7DoFEnv, VelocityHalfCheetahEnv, registration
 from gym_dgpmpc.envs.registration import ENVIRONMENTS
 from gym_dgpmpc.wrappers import RiskSensitiveReward
 from tests.envs.common import play, section, table, uniform_actions
 
-CLASSES = [ModCartPoleEnv, SwingUpCartPoleEnv, Reacher7DoFEnv, BiasedReacherEnv, VelocityHalfCheetahEnv]
+CLASSES = [getattr(envs, name) for name in registration.CLASSES]
 DESCRIBED = {ModCartPoleEnv: "ModCartPole-v0", Reacher7DoFEnv: "Reacher7DoF-v0"}
 DESCRIBED |= {VelocityHalfCheetahEnv: "VelocityHalfCheetah-v0"}  # classes with a full description, and an id of each
 

@@ -38,8 +38,9 @@ def test_a_ready_made_planner_has_its_settings():
 
 
 def test_an_unknown_name_is_answered_with_those_there_are(registered):
-    with pytest.raises(ValueError, match=r"'icem'.*\['cem', 'random-shooting'\]"):
+    with pytest.raises(ValueError) as error:
         make_planner("icem", SPACE)
+    assert all(repr(name) in str(error.value) for name in ("icem", "cem", "random-shooting"))
 
 
 @pytest.mark.parametrize("given", [None, 3, torch.zeros(2)])
