@@ -35,7 +35,7 @@ LAYERS = (
 """Each layer imports only from itself and from those above it. The public names stand below all that they name, and the
 package `benchmarks`, which is not installed, below the whole of `gym_dgpmpc`."""
 
-MOST_CODE, MOST_BODY = 250, 45
+MOST_CODE, MOST_BODY = 250, 55
 """Lines of code in a module, and in a function's body: without docstrings, comments, blank lines and signatures."""
 LONG_ON_PURPOSE = {"gym_dgpmpc.agents.mpc": 550}
 """One class, the agent, that is not cut in slices: it names what it has, and its loop stands on one screen."""
