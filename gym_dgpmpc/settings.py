@@ -117,7 +117,7 @@ def argument_texts(docstring: str) -> dict[str, str]:
         if line and not line[0].isspace():
             in_section = line.strip() in ("Args:", "Attributes:")
             continue
-        entry = re.match(r" {4}(\w+(?:, \w+)*): (.*)", line)
+        entry = re.match(r" {4}(\*{0,2}\w+(?:, \w+)*): (.*)", line)
         if in_section and entry:
             names = entry[1].split(", ")
             texts |= dict.fromkeys(names, entry[2].strip())

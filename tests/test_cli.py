@@ -2,62 +2,46 @@
 
 import csv
 import importlib.metadata
-import inspect
 import json
 import os
 import re
 import signal
 import subprocess
 import sys
-import typing
+from pathlib import Path
 
 import gymnasium
 import pytest
 from typer.testing import CliRunner
 
-from gym_dgpmpc import cli, options
+from gym_dgpmpc import cli
 from gym_dgpmpc.agents import DGPMPCAgent
 from gym_dgpmpc.agents.presets import PAPER, STOCK
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.checkpoints.format import read_checkpoint
+from gym_dgpmpc.cli import options
 from gym_dgpmpc.dynamics.deep_gp.draws import DRAWS, REFRESHES
 from gym_dgpmpc.gp.kernels import KERNELS
+from gym_dgpmpc.planning import PLANNERS, register_planner
 from gym_dgpmpc.runs import rendering
 from tests.agents.point_mass import LENGTH
+from tests.command_line import SMALLEST, dgpmpc, is_one_line_error
+from tests.planning.toy_planners import RandomShooting
 from tests.runs.toy import ENV_ID, ToyPush
 from tests.tasks.test_goals import Goal
-
-SMALLEST = ["--layers=1", "--inducing=4", "--features=4", "--particles=2", "--horizon=3", "--candidates=6"]
-SMALLEST += ["--iterations=1", "--first-training=2", "--training=2", "--samples=2", "--spacing=1", "--resample=0"]
 
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     """Calls the command in an empty folder."""
     monkeypatch.chdir(tmp_path)
-    runner = CliRunner()
-    return lambda *arguments: runner.invoke(cli.app, [str(argument) for argument in arguments])
+    return dgpmpc
 
 
 @pytest.fixture
 def drawable(monkeypatch):
     """The toy needs no OpenGL, and a process of its own would take seconds to find that out."""
     monkeypatch.setattr(rendering, "probe_rendering", lambda env_id: rendering.Rendering(True))
-
-
-def is_one_line_error(result, *texts):
-    assert result.exit_code == 2
-    assert result.stderr.startswith("error: ")
-    assert result.stderr.count("\n") == 1
-    for text in texts:
-        assert text in result.stderr
-    return True
-
-
-def shown_defaults():
-    """What the help of `dgpmpc train` shows for the options that can be left open."""
-    hints = typing.get_type_hints(cli.train.train, include_extras=True)
-    return {name: hints[name].__metadata__[0].show_default for name in hints if hasattr(hints[name], "__metadata__")}
 
 
 def test_train_and_evaluate(run, tmp_path, drawable):
@@ -228,10 +212,10 @@ def test_a_reward_that_nobody_knows_is_learned(run, drawable):
 
 def test_what_is_known_is_learned_when_asked(run):
     command = ("train", ENV_ID, *SMALLEST, "--episodes", 1, "--no-video", "--out", "a")
-    result = run(*command, "--reward", "learned", "--termination", "learned")
+    result = run(*command, "--reward-fn", "learned", "--terminated-fn", "learned")
     assert result.exit_code == 0, result.output
     assert result.stdout.startswith("reward: learned | termination: learned, once an episode has terminated\n")
-    assert read_checkpoint("a/agent.zip").config["modelled"]["reward"]
+    assert read_checkpoint("a/agent.zip").config["values"]["task"]["reward"]
     assert is_one_line_error(run(*command), "reward_fn was learned, now None")
 
 
@@ -266,7 +250,7 @@ def test_a_task_in_a_module_that_lies_in_the_folder(run, tmp_path, monkeypatch):
 
 
 def test_a_task_without_end(run):
-    often = ["--timesteps", 30, "--random-steps", 8, "--train-freq", 9, "--no-video", "--out", "a"]
+    often = ["--timesteps", 30, "--learning-starts", 8, "--train-freq", 9, "--no-video", "--out", "a"]
     assert run("train", "ToyPushForever-v0", *SMALLEST, *often).exit_code == 0
     checkpoint = read_checkpoint("a/agent.zip")
     assert checkpoint.config["values"]["progress"]["num_fitted"] == 26
@@ -282,11 +266,24 @@ def test_an_error_without_words_says_where_it_was(run, monkeypatch):
     )
 
 
-@pytest.mark.parametrize("option", ["--layers=0", "--kernel=linear", "--draw=x", "--episodes=0", "--seed=-1"])
-def test_limits_of_options(run, option):
-    result = run("train", "ToyPush-v0", option)
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [
+        ("--kernel=linear", "--kernel"),
+        ("--draw=x", "--draw"),
+        ("--planner=x", "--planner"),
+        ("--episodes=0", "--episodes"),
+        ("--seed=-1", "--seed"),
+        ("--layers=two", "--layers"),
+        ("--num-layers=0", "num_layers"),
+        ("--candidates=0", "num_candidates"),
+        ("--time-budget=-1", "time_budget"),
+    ],
+)
+def test_limits_of_options(run, option, name):
+    result = run("train", ENV_ID, option, "--no-video")
     assert result.exit_code == 2
-    assert option.split("=")[0] in result.stderr
+    assert name in result.stderr
 
 
 def test_evaluate_says_what_is_wrong(run, tmp_path):
@@ -318,23 +315,53 @@ def test_runs_as_a_module():
     assert result.stdout.startswith("dgpmpc ")
 
 
-def test_options_show_the_agents_defaults_and_the_presets():
-    arguments = inspect.signature(DGPMPCAgent).parameters
-    options_of_the_agent = {name: shown for name, shown in shown_defaults().items() if name in arguments}
-    assert len(options_of_the_agent) == 23
-    del options_of_the_agent["seed"]  # the command line has a default of its own
-    assert inspect.signature(cli.train.train).parameters.keys() >= options_of_the_agent.keys()
-    for name, shown in options_of_the_agent.items():
-        default = arguments[name].default
-        assert inspect.signature(cli.train.train).parameters[name].default is None
-        assert default is None or shown.split(",")[0] == str(default)
-        presets = {preset[name] for preset in (*PAPER.values(), *STOCK.values()) if name in preset}
-        assert ("ENV_ID" in shown) == bool(presets - {default}) or name == "num_elites"
-    assert options_of_the_agent["num_elites"] == "a tenth of the candidates"
-    assert all(10 * preset["num_elites"] == preset["num_candidates"] for preset in PAPER.values())
+def test_every_plain_setting_is_an_option(run):
+    """Called as it is, with what it means; `--help` shows the default or says that the preset decides."""
+    shown = re.sub(r"[\s│]+", " ", run_wide("train", "--help"))
+    settings = {**DGPMPCAgent.own_settings(), **DGPMPCAgent.part_settings("cem")}
+    plain = [name for name, setting in settings.items() if setting.annotation in (int, float, bool, str)]
+    assert len(plain) > 20
+    for name in set(plain) - options.SET_BY_THE_RUN:
+        assert f"--{name.replace('_', '-')}" in shown
+        preset = any(name in each for each in (*PAPER.values(), *STOCK.values()))
+        assert f"{settings[name].default}{' or the preset' if preset else ''}" in shown
+    for choices in (KERNELS, DRAWS, REFRESHES, PLANNERS):
+        assert "|".join(choices) in shown
 
 
-def test_choices_are_the_models():
-    assert {name.value for name in options.KernelName} == set(KERNELS)
-    assert {name.value for name in options.DrawName} == set(DRAWS)
-    assert {name.value for name in options.RefreshName} == set(REFRESHES)
+def run_wide(*arguments):
+    return CliRunner().invoke(cli.app, [*arguments], env={"COLUMNS": "400"}).stdout
+
+
+def test_short_and_long_names_of_an_option_are_the_same(run):
+    for layers in ("--layers", "--num-layers"):
+        out = f"a{layers}"
+        result = run("train", ENV_ID, *SMALLEST, layers, 2, "--episodes", 1, "--no-video", "--out", out)
+        assert result.exit_code == 0, result.output
+        assert read_checkpoint(f"{out}/agent.zip").config["arguments"]["num_layers"] == 2
+
+
+def test_any_registered_planner(run):
+    register_planner("shooting", RandomShooting)
+    try:
+        sizes = [option for option in SMALLEST if "--iterations" not in option]
+        command = ("train", ENV_ID, *sizes, "--planner", "shooting", "--episodes", 1, "--no-video", "--out", "a")
+        result = run(*command)
+        assert result.exit_code == 0, result.output
+        assert read_checkpoint("a/agent.zip").config["arguments"]["planner"] == "shooting"
+        assert run("evaluate", "a", "--episodes", 1).exit_code == 0
+        assert is_one_line_error(run(*command, "--smoothing", 0.5), "shooting", "smoothing")
+        assert is_one_line_error(run("train", ENV_ID, *SMALLEST, "--no-video", "--out", "a"), "planner", "cem")
+    finally:
+        del PLANNERS["shooting"]
+
+
+def test_a_run_from_before_a_setting_existed_goes_on(run):
+    command = ("train", ENV_ID, *SMALLEST, "--no-video", "--out", "a")
+    assert run(*command, "--episodes", 1).exit_code == 0
+    content = json.loads(Path("a/settings.json").read_text())
+    del content["settings"]["planner"], content["settings"]["smoothing"]
+    Path("a/settings.json").write_text(json.dumps(content))
+    result = run(*command, "--episodes", 2)
+    assert result.exit_code == 0, result.output
+    assert is_one_line_error(run(*command, "--smoothing", 0.5), "smoothing was 0.1, now 0.5")

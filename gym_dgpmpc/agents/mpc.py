@@ -868,6 +868,9 @@ class MPCAgent(BaseAlgorithm):
             self._last_episode_starts = episode_starts
 
 
+MPCAgent.__signature__ = composed_signature(MPCAgent, MPCAgent.own_settings())  # type: ignore[attr-defined]
+
+
 def _property(name: str) -> property:
     """A setting, to be read on the agent; it is decided when the agent is made."""
     return property(lambda agent: agent.composition.setting(name))

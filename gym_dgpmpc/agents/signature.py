@@ -77,7 +77,7 @@ def _is_policy(args: list[Any], env: Any) -> bool:
 
 
 def composed_signature(agent: type, own: Settings, *of_parts: Settings) -> inspect.Signature:
-    """What `inspect.signature` and `help` show of a named agent: everything that it takes, with its defaults.
+    """What `inspect.signature` and `help` show of an agent: everything that it takes, with its defaults.
 
     Raises:
         ValueError: two parts have a setting of the same name.
@@ -92,7 +92,9 @@ def composed_signature(agent: type, own: Settings, *of_parts: Settings) -> inspe
     for setting in joined(*of_parts, own).values():
         parameters.append(setting.parameter(planner_defaults.get(setting.name, setting.default)))
     parameters += [base[name].replace(default="cem" if name == "planner" else base[name].default) for name in NOT_PLAIN]
-    parameters.append(inspect.Parameter("_init_setup_model", inspect.Parameter.KEYWORD_ONLY, default=True))
+    if agent is _base(agent):  # takes any model, and any planner's settings
+        parameters.insert(2, base["dynamics"].replace(kind=keyword))
+        parameters.append(base["settings"])
     return inspect.Signature(parameters)
 
 

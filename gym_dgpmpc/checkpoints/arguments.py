@@ -62,14 +62,15 @@ def saved_arguments(checkpoint: Checkpoint, agent_class: Any, planner: Any = Non
     if not isinstance(received, dict):
         raise CheckpointError(f"the file's arguments must be an object, got {received!r}")
     saved_planner = received.get("planner")
-    if saved_planner is not None and saved_planner not in PLANNERS:
+    if planner is None and saved_planner is not None and saved_planner not in PLANNERS:
         raise CheckpointError(
             f"the file's planner is {saved_planner!r}, and registered are {sorted(PLANNERS)}: register it with "
             "gym_dgpmpc.planning.register_planner before loading, or pass planner=... to load"
         )
-    known = _known(agent_class, saved_planner)
+    is_known = saved_planner is None or saved_planner in PLANNERS
+    known = _known(agent_class, saved_planner if is_known else planner)
     unknown = sorted(set(received) - set(known) - {"planner"})
-    if unknown:
+    if unknown and is_known:
         raise CheckpointError(
             f"the file's arguments {unknown} are not those of a {agent_class.__name__}: expected {sorted(known)}. If "
             "another version of the package wrote it, load it with that one"
@@ -110,13 +111,13 @@ def encode(value: Any) -> Any:
 
 
 def decode(value: Any) -> Any:
-    """The inverse of `encode`.
+    """The inverse of `encode`; a list becomes a tuple.
 
     Raises:
         CheckpointError: the value is not one that `encode` gives.
     """
     if not isinstance(value, dict):
-        return value
+        return _as_tuple(value)
     try:
         return ObservationSpec(**{name: _as_tuple(indices) for name, indices in value["observation_spec"].items()})
     except Exception as error:

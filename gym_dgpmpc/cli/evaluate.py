@@ -32,6 +32,7 @@ def evaluate(
     from gym_dgpmpc.agents import MPCAgent
     from gym_dgpmpc.checkpoints.folder import NEWEST
     from gym_dgpmpc.checkpoints.format import read_checkpoint
+    from gym_dgpmpc.checkpoints.restore import about_environment
     from gym_dgpmpc.runs.recording import Episode, EpisodeRecorder
     from gym_dgpmpc.runs.rendering import write_gif
 
@@ -46,7 +47,7 @@ def evaluate(
         file = path / NEWEST if path.is_dir() else path
         if not file.is_file():
             raise ValueError(f"expected a folder of `dgpmpc train` or an agent's file, but there is no file {file}")
-        env_id = env_id or read_checkpoint(file).config.get("environment")
+        env_id = env_id or about_environment(read_checkpoint(file)).get("environment")
         if env_id is None:
             raise ValueError(f"{file} does not say which environment it was trained in: give --env ENV_ID")
         no_video = prepare_video(env_id) if video else "not asked for"

@@ -179,7 +179,7 @@ def test_counts_are_positive(name):
 def test_a_plain_agent_needs_its_parts():
     from gym_dgpmpc import MPCAgent
 
-    with pytest.raises(ValueError, match=r"dynamics=.*planner="):
+    with pytest.raises(ValueError, match="dynamics="):
         MPCAgent(KnownPointMass())
 
 

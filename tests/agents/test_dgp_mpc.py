@@ -1,7 +1,6 @@
 """The paper's agent with its real parts, at a tiny size."""
 
 import inspect
-import re
 
 import numpy as np
 import pytest
@@ -156,17 +155,6 @@ def test_the_defaults_are_the_papers_on_the_cart_pole():
     parameters = inspect.signature(DGPMPCAgent).parameters
     preset = {**presets.PAPER["ModCartPole-v0"], "num_elites": None}  # a tenth, which is 30 of 300
     assert {name: parameters[name].default for name in preset} == preset
-
-
-@pytest.mark.parametrize("agent_class", [DGPMPCAgent, MPCAgent])
-def test_every_argument_is_documented_and_every_plain_one_saved(agent_class):
-    public = [name for name in inspect.signature(agent_class).parameters if not name.startswith("_")]
-    for name in public:
-        assert re.search(rf"^        {name}: ", agent_class.__doc__, re.MULTILINE), name
-    assert set(public) - set(agent_class.saved_arguments) <= {
-        "env", "dynamics", "planner", "reward_fn", "terminated_fn", "device", "compile",
-    }  # fmt: skip
-    assert set(agent_class.saved_arguments) <= set(public)
 
 
 def test_the_package_exports_the_agents():

@@ -85,10 +85,10 @@ def test_several_of_them(tmp_path):
     assert loaded.store.transitions().observation[26:28, 0].tolist() == pytest.approx([0.51] * 2)
 
 
-def test_options_that_are_none_are_named(tmp_path):
+def test_options_of_the_wrong_kind_are_named(tmp_path):
     agent(Numbered()).learn(3).save(tmp_path / "agent")
     checkpoint = read_checkpoint(tmp_path / "agent")
-    checkpoint.config["reset_options"] = ["4"]
+    checkpoint.config["values"]["task"]["about_environment"]["reset_options"] = ["4"]
     write_checkpoint(checkpoint, tmp_path / "agent")
     with pytest.raises(CheckpointError, match="options for the environment's reset cannot be read"):
         MPCAgent.load(tmp_path / "agent", env=Numbered(), dynamics=LinearModel(), planner=agent().planner)

@@ -14,7 +14,7 @@ from benchmarks.suites import Cell, RunSuite
 from benchmarks.tasks import TASKS
 from gym_dgpmpc import cli
 from tests.benchmarks.toy import TINY, TOY, Diary, Errand, toy
-from tests.test_cli import is_one_line_error
+from tests.command_line import is_one_line_error
 
 DGP = "DGP-MPC L=1 matern32"
 

@@ -11,7 +11,7 @@ from benchmarks.report.pages import write_report
 from benchmarks.report.provenance import Origins
 from benchmarks.result_files import ResultError
 from tests.benchmarks.made_up import grouped, run
-from tests.test_cli import is_one_line_error
+from tests.command_line import is_one_line_error
 
 OWN = "DGP-MPC L=2 matern32"
 
