@@ -49,7 +49,8 @@ Presets = Callable[[Task], Mapping[str, Any]]
 class PlanningMethod:
     """A method that learns a model and plans with it, or plans with the true one.
 
-    It plans by CEM unless ``planner="..."`` is asked for; then the settings of CEM give way to those of that planner.
+    It plans by CEM unless ``fixed`` or what is asked for names another ``planner``; then the settings of CEM
+    give way to those of that planner.
 
     Attributes:
         name: its name in a report.
@@ -72,7 +73,7 @@ class PlanningMethod:
             ValueError: the agent has no argument of a name that is asked for.
         """
         given = {**self.presets(task), **self.fixed, **task.for_planning}
-        defaults, planner = _defaults(self.make_agent), asked.get("planner", "cem")
+        defaults, planner = _defaults(self.make_agent), {"planner": "cem", **given, **asked}["planner"]
         if planner != "cem":
             mine, cems = settings_of(planner_factory(planner)), settings_of(planner_factory("cem"))
             given = {name: value for name, value in given.items() if name in mine or name not in cems}

@@ -1,6 +1,7 @@
 """Baselines are set as the work that they stand for has them, and as the comparison of the paper plans."""
 
 import inspect
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,3 +81,5 @@ def test_a_planner_brings_its_own_settings(monkeypatch):
     agent = method.make(env, found, seed=0)
     env.close()
     assert isinstance(agent.planner, RandomShooting) and agent.planner.num_candidates == 20
+    of_its_own = replace(method, fixed={**method.fixed, "planner": "random-shooting"})
+    assert of_its_own.settings(task, num_candidates=20) == found
