@@ -20,7 +20,7 @@ from gym_dgpmpc.cli.common import (
 from gym_dgpmpc.settings import refuse_unknown
 
 if TYPE_CHECKING:
-    from gym_dgpmpc.runs.run import TrainingRun
+    from gym_dgpmpc.runs.training import TrainingRun
 
 DEFAULT_EPISODES = 15
 RUN = "Run"
@@ -128,7 +128,8 @@ def _set_up_run(
 ) -> "TrainingRun":
     """The run that the options describe."""
     from gym_dgpmpc.agents import DGPMPCAgent
-    from gym_dgpmpc.runs.run import RunFolder, TrainingRun, step_limit
+    from gym_dgpmpc.runs.folder import RunFolder
+    from gym_dgpmpc.runs.training import TrainingRun, step_limit
 
     assert env.spec is not None
     env_id, max_steps = env.spec.id, env.spec.max_episode_steps

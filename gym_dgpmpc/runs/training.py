@@ -1,174 +1,24 @@
-"""A training run and its folder: results as they come, a saved agent after every episode, figures at the end.
+"""A training run: an agent learns in an environment, and a `RunFolder` takes its results as they come.
 
-The folder holds `settings.json` (what was asked, with which versions), `episodes.csv` (raw results), `agent.zip` (and
-`agent.previous.zip`, the one before), `tensorboard/`, and when the run ends `learning_curve.png`, `prediction_fan.png`
-and `last_episode.gif`. A run that was killed goes on to the same files; only what tells the time differs.
+`dgpmpc train` and the benchmarks are made of it. A run that was killed goes on to the same files; only the columns of
+wall-clock times differ then from those of a run that was not.
 """
 
-import csv
-import io
-import json
-import shutil
-from collections.abc import Callable, Mapping
-from datetime import datetime, timezone
+from collections.abc import Callable
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple
 
 import gymnasium
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from gym_dgpmpc.agents import MPCAgent
-from gym_dgpmpc.checkpoints.files import replace_text
-from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.checkpoints.safeguard import resume_from
-from gym_dgpmpc.errors import DGPMPCError
 from gym_dgpmpc.runs.figures import observation_labels, plot_learning_curve, plot_prediction_fan
-from gym_dgpmpc.runs.provenance import machine, revision, versions
+from gym_dgpmpc.runs.folder import LAST_EPISODE, LEARNING_CURVE, LOGS, PREDICTION_FAN, EpisodeRow, RunFolder
 from gym_dgpmpc.runs.recording import EpisodeRecorder, ForecastCallback
 from gym_dgpmpc.runs.rendering import write_gif
 
-SETTINGS_FILE, EPISODES_FILE, LOGS, LOG_NAME = "settings.json", "episodes.csv", "tensorboard", "DGPMPC"
-FIGURES = LEARNING_CURVE, PREDICTION_FAN, LAST_EPISODE = "learning_curve.png", "prediction_fan.png", "last_episode.gif"
-
-
-class RunFolderError(DGPMPCError, ValueError):
-    """A folder holds something else than the run that is asked for."""
-
-
-class EpisodeRow(NamedTuple):
-    """One line of `episodes.csv`."""
-
-    episode: int
-    """Counts from 1, the random ones included."""
-    actions: str
-    """"random" if its first actions were, else "planned"."""
-    episode_return: float
-    steps: int
-    total_steps: int
-    """Environment steps of the run up to the episode's end."""
-    seconds: float
-    """Wall-clock time that it took, with the training before it."""
-    planning_seconds: float = 0.0
-    """The part of it in which plans were made."""
-    success: bool | None = None
-    """Whether the goal was reached in the last step, of tasks that say so in ``info["is_success"]``."""
-
-    @classmethod
-    def from_text(cls, row: dict[str, str]) -> "EpisodeRow":
-        """A row as `csv.DictReader` reads it; one of an older version lacks the last columns."""
-        success = row.get("success") or None
-        return cls(
-            int(row["episode"]),
-            row["actions"],
-            float(row["episode_return"]),
-            int(row["steps"]),
-            int(row["total_steps"]),
-            float(row["seconds"]),
-            float(row.get("planning_seconds", 0.0)),
-            None if success is None else success == str(True),
-        )
-
-
-def read_rows(path: Path) -> list[EpisodeRow]:
-    """All episodes in an `episodes.csv`; none if there is no such file."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return [EpisodeRow.from_text(row) for row in csv.DictReader(file)]
-
-
-class RunFolder:
-    """The files of one run, held by this process until `close`.
-
-    Args:
-        path: the folder; made if there is none.
-        settings: what identifies the run: going on with another run's folder is refused.
-        defaults: what a setting was in a run that began before there was such a setting.
-        overwrite: begin anew even if the folder holds a run.
-        otherwise: what the error over another run's folder advises.
-
-    Raises:
-        RunFolderError: the folder holds a run with other settings.
-        RunInUseError: another process holds it.
-        CheckpointWriteError: it cannot be written to. It is an OSError too.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        settings: dict[str, Any],
-        *,
-        defaults: Mapping[str, Any] = MappingProxyType({}),
-        overwrite: bool = False,
-        otherwise: str = "choose another folder with --out, or --overwrite to begin anew",
-    ):
-        self.path, self.settings = path, json.loads(json.dumps(settings))
-        self._defaults = json.loads(json.dumps(dict(defaults)))
-        self._otherwise = otherwise
-        self.checkpoints = RunCheckpoints(path)
-        self.agent_file, self.episodes_file = self.checkpoints.newest, path / EPISODES_FILE
-        try:
-            if overwrite:
-                self.checkpoints.delete()
-                for name in (SETTINGS_FILE, EPISODES_FILE, *FIGURES):
-                    (path / name).unlink(missing_ok=True)
-                shutil.rmtree(path / LOGS, ignore_errors=True)
-            self.goes_on = self.checkpoints.exist
-            if self.goes_on:
-                self._refuse_other_settings()
-        except BaseException:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Let another process have the folder."""
-        self.checkpoints.close()
-
-    def write_settings(self, **facts: Any) -> None:
-        """Write settings, versions and machine; ``facts`` are told but do not identify the run.
-
-        Of a run that goes on, the time at which it started stays.
-        """
-        now = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        content = {
-            "settings": self.settings,
-            **facts,
-            "started": self.read_settings().get("started", now) if self.goes_on else now,
-            "revision": revision(),
-            "versions": versions(),
-            "machine": machine(),
-        }
-        replace_text(self.path / SETTINGS_FILE, json.dumps(content, indent=2) + "\n")
-
-    def read_settings(self) -> dict[str, Any]:
-        """What `write_settings` wrote the last time."""
-        return json.loads((self.path / SETTINGS_FILE).read_text())
-
-    def rows(self) -> list[EpisodeRow]:
-        """All episodes so far."""
-        return read_rows(self.episodes_file)
-
-    def write_rows(self, rows: list[EpisodeRow]) -> None:
-        """Replace all rows, the column names included; a kill leaves the old rows or the new ones."""
-        text = io.StringIO(newline="")
-        csv.writer(text).writerows([EpisodeRow._fields, *rows])
-        replace_text(self.episodes_file, text.getvalue())
-
-    def _refuse_other_settings(self) -> None:
-        try:
-            before = {**self._defaults, **self.read_settings()["settings"]}
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise RunFolderError(f"{self.path} holds an agent without readable {SETTINGS_FILE}: {error}") from error
-        differing = [
-            f"{name} was {before.get(name)}, now {self.settings.get(name)}"
-            for name in sorted({*before, *self.settings})
-            if before.get(name) != self.settings.get(name)
-        ]
-        if differing:
-            raise RunFolderError(
-                f"{self.path} holds a run with other settings ({'; '.join(differing)}): {self._otherwise}"
-            )
+LOG_NAME = "DGPMPC"
+"""Name of the run within TensorBoard's folder."""
 
 
 def step_limit(num_episodes: int, episode_steps: int, learning_starts: int | None) -> int:
