@@ -32,10 +32,11 @@ from gym_dgpmpc.dynamics.deep_gp.draws import (
 )
 from gym_dgpmpc.dynamics.deep_gp.start import initial_model, relocate, restandardise
 from gym_dgpmpc.dynamics.learner import Learner
-from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
+from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all
 from gym_dgpmpc.gp.kernels import Kernel, find_kernel
+from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.inference import mcem, sghmc, training
 from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
 from gym_dgpmpc.inference.mcem import InferenceSettings
@@ -291,8 +292,9 @@ class DeepGPDynamics(Learner[_Fitted]):
         def take(name: str, *shape: int) -> Tensor:
             return take_tensor(state, name, shape, device)
 
+        shapes = parameter_shapes(self.num_inducing, size)
         layers = (
-            take_layer(state, f"layers.{i}.", self.kernel, self.num_inducing, size, device)
+            Layer(self.kernel, **take_tensors(state, shapes, device, prefix=f"layers.{i}."))
             for i in range(self.num_layers)
         )
         model = DeepGP(tuple(layers), take("log_noise", num_targets))

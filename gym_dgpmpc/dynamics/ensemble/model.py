@@ -26,7 +26,7 @@ from gym_dgpmpc.dynamics.ensemble.network import (
 )
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner
-from gym_dgpmpc.dynamics.state import take_normaliser, take_tensor
+from gym_dgpmpc.dynamics.state import take_normaliser, take_tensors
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
 
@@ -201,13 +201,11 @@ class EnsembleDynamics(Learner[_Fitted]):
 
         shapes = self._shapes()
         device, single = self.device, torch.float32
-        network = Ensemble.from_parameters(
-            {name: take_tensor(state, name, shape, device, single) for name, shape in shapes.items()}
-        )
+        network = Ensemble.from_parameters(take_tensors(state, shapes, device, single))
         inputs = take_normaliser(state, "inputs", self.encoder.input_size, device)
         moments = {
             name: _Moments(
-                *(take_tensor(state, f"adam.{name}.{key}", shape, device, single) for key in _Moments._fields)
+                **take_tensors(state, dict.fromkeys(_Moments._fields, shape), device, single, prefix=f"adam.{name}.")
             )
             for name, shape in shapes.items()
         }

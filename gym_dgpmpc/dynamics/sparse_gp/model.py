@@ -20,10 +20,10 @@ from gym_dgpmpc.dynamics.deep_gp.start import NOISE_VARIANCE, restandardise
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.sparse_gp.moment_matching import MomentMatchingSampler
-from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
+from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.gp.deep_gp import DeepGP
 from gym_dgpmpc.gp.kernels import RBF, Kernel, find_kernel
-from gym_dgpmpc.gp.layer import Layer
+from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.gp.moments import Predictor
 from gym_dgpmpc.gp.sgpr import SparsePosterior, shrinkage, sparse_posterior, sparse_predict
 from gym_dgpmpc.inference.lbfgs import maximise_bound
@@ -177,15 +177,14 @@ class SparseGPDynamics(Learner[_Fitted]):
         received = state.get("inducing_inputs")
         count = len(received) if isinstance(received, Tensor) and received.ndim == 2 else self.num_inducing
         count = count if self.exact else min(count, self.num_inducing)
-        layer = take_layer(state, "", self.kernel, count, sizes[0], device)
+        layer = Layer(self.kernel, **take_tensors(state, parameter_shapes(count, sizes[0]), device))
         model = DeepGP((layer,), take_tensor(state, "log_noise", (sizes[1],), device))
         normalisers = (
             take_normaliser(state, "inputs", sizes[0], device),
             take_normaliser(state, "targets", sizes[1], device),
         )
-        matrices = ((count, count), (count,), (count, sizes[1]))
-        names = (f"posterior.{name}" for name in SparsePosterior._fields)
-        posterior = SparsePosterior(*(take_tensor(state, *pair, device) for pair in zip(names, matrices, strict=True)))
+        shapes = dict(zip(SparsePosterior._fields, ((count, count), (count,), (count, sizes[1])), strict=True))
+        posterior = SparsePosterior(**take_tensors(state, shapes, device, prefix="posterior."))
         self._fitted = _Fitted(model, normalisers, posterior)
 
     def _start(self, data: Data, normalisers: tuple[Normaliser, Normaliser], generator: torch.Generator) -> DeepGP:
