@@ -25,7 +25,7 @@ FIGURES = LEARNING_CURVE, PREDICTION_FAN, LAST_EPISODE = "learning_curve.png", "
 
 
 class RunFolderError(DGPMPCError, ValueError):
-    """A folder holds something else than the run that is asked for."""
+    """A folder holds another run than the one that was asked for."""
 
 
 class EpisodeRow(NamedTuple):
@@ -42,13 +42,13 @@ class EpisodeRow(NamedTuple):
     seconds: float
     """Wall-clock time that it took, with the training before it."""
     planning_seconds: float = 0.0
-    """The part of it in which plans were made."""
+    """The part of that time in which plans were made."""
     success: bool | None = None
-    """Whether the goal was reached in the last step, of tasks that say so in ``info["is_success"]``."""
+    """Whether the goal was reached in the last step, for tasks that say so in ``info["is_success"]``."""
 
     @classmethod
     def from_text(cls, row: dict[str, str]) -> "EpisodeRow":
-        """A row as `csv.DictReader` reads it; one of an older version lacks the last columns."""
+        """A row as `csv.DictReader` reads it; older versions lack the last columns."""
         success = row.get("success") or None
         return cls(
             int(row["episode"]),
@@ -63,7 +63,7 @@ class EpisodeRow(NamedTuple):
 
 
 def read_rows(path: Path) -> list[EpisodeRow]:
-    """All episodes in an `episodes.csv`; none if there is no such file."""
+    """All episodes in an `episodes.csv`; an empty list if the file does not exist."""
     if not path.exists():
         return []
     with path.open(newline="") as file:
@@ -74,11 +74,11 @@ class RunFolder:
     """The files of one run, held by this process until `close`.
 
     Args:
-        path: the folder; made if there is none.
-        settings: what identifies the run: going on with another run's folder is refused.
-        defaults: what a setting was in a run that began before there was such a setting.
-        overwrite: begin anew even if the folder holds a run.
-        otherwise: what the error over another run's folder advises.
+        path: the folder; made if it does not exist.
+        settings: what identifies the run. A folder that holds a run with others is refused.
+        defaults: the values of settings in runs that are older than these settings.
+        overwrite: delete the run that the folder holds, and begin anew.
+        otherwise: what the error about another run's folder advises.
 
     Raises:
         RunFolderError: the folder holds a run with other settings.
@@ -97,7 +97,7 @@ class RunFolder:
     ):
         self.path, self.settings = path, json.loads(json.dumps(settings))
         self._defaults = json.loads(json.dumps(dict(defaults)))
-        self._otherwise = otherwise
+        self._advice = otherwise
         self.checkpoints = RunCheckpoints(path)
         self.agent_file, self.episodes_file = self.checkpoints.newest, path / EPISODES_FILE
         try:
@@ -118,9 +118,9 @@ class RunFolder:
         self.checkpoints.close()
 
     def write_settings(self, **facts: Any) -> None:
-        """Write settings, versions and machine; ``facts`` are told but do not identify the run.
+        """Write settings, versions and machine; ``facts`` are recorded but do not identify the run.
 
-        Of a run that goes on, the time at which it started stays.
+        A run that goes on keeps the time at which it started.
         """
         now = datetime.now(timezone.utc).isoformat(timespec="seconds")
         content = {
@@ -151,7 +151,7 @@ class RunFolder:
         try:
             before = {**self._defaults, **self.read_settings()["settings"]}
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise RunFolderError(f"{self.path} holds an agent without readable {SETTINGS_FILE}: {error}") from error
+            raise RunFolderError(f"{self.path} holds an agent, but {SETTINGS_FILE} cannot be read: {error}") from error
         differing = [
             f"{name} was {before.get(name)}, now {self.settings.get(name)}"
             for name in sorted({*before, *self.settings})
@@ -159,5 +159,5 @@ class RunFolder:
         ]
         if differing:
             raise RunFolderError(
-                f"{self.path} holds a run with other settings ({'; '.join(differing)}): {self._otherwise}"
+                f"{self.path} holds a run with other settings ({'; '.join(differing)}): {self._advice}"
             )

@@ -25,11 +25,11 @@ def step_limit(num_episodes: int, episode_steps: int, learning_starts: int | Non
     """Environment steps within which so many episodes are planned from their first step on, after random actions.
 
     Args:
-        num_episodes: how many.
-        episode_steps: the most that one has.
-        learning_starts: random actions; None: one episode of them.
+        num_episodes: planned episodes.
+        episode_steps: steps of an episode, at most.
+        learning_starts: random actions; None means one episode of them.
     """
-    # Planning may begin in the middle of an episode, which then is none of those that are asked for.
+    # Planning may begin in the middle of an episode, which then does not count towards the number.
     at_random = episode_steps if learning_starts is None else learning_starts + episode_steps
     return at_random + num_episodes * episode_steps
 
@@ -42,15 +42,15 @@ class TrainingRun:
         env: the environment; if it renders `rgb_array` the last episode becomes a GIF.
         make_agent: makes the agent: (environment, verbose=..., tensorboard_log=...) -> `MPCAgent`.
         num_episodes: planned episodes after which to stop, or None.
-        total_timesteps: environment steps after which to stop, the random ones included; with ``num_episodes``, those
+        total_timesteps: environment steps after which to stop, the random ones included. With ``num_episodes``, steps
             of an episode that was given up when the run was interrupted do not count.
         checkpoint_every: see `MPCAgent.learn`.
-        title: of the figures.
-        results_only: print nothing, draw nothing, and leave out what the agent would learn from the last episode,
-            which it does first of all if the run goes on to more episodes.
+        title: heading of the figures.
+        results_only: print nothing, draw nothing, and skip the training after the last episode, which comes first if
+            the run goes on to more episodes.
 
     Raises:
-        CheckpointError: the folder's checkpoints are damaged, or of another agent.
+        CheckpointError: the folder's checkpoints are damaged or belong to another agent.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class TrainingRun:
             # An episode whose row was written but whose agent was not saved will be played again.
             rows = [row for row in folder.rows() if row.total_steps <= self.agent.num_timesteps]
             if num_episodes is not None and not self.agent.has_running_episode:
-                # A new episode begins. Steps of those given up, which have no row, cost none of the episodes asked for.
+                # A new episode begins. Steps of episodes given up, which have no row, do not reduce the planned ones.
                 self.total_timesteps += self.agent.num_timesteps - sum(row.steps for row in rows)
         folder.write_rows(rows)
         self.figures: list[Path] = []
@@ -102,7 +102,7 @@ class TrainingRun:
             KeyboardInterrupt, SystemExit: Ctrl-C or SIGTERM; see `MPCAgent.learn`.
         """
         callback = CallbackList([*([] if self.forecasts is None else [self.forecasts]), _KeepEpisodes(self)])
-        # A run that the callback stops ends before its last episode is learned from; without steps `learn` only trains.
+        # The callback stops a run before the training on its last episode; `learn` without steps does only that.
         steps = 0 if self._has_enough else self.total_timesteps - self.agent.num_timesteps
         for steps_of_call in (steps,) if self.results_only else (steps, 0):
             self.agent.learn(
@@ -118,7 +118,7 @@ class TrainingRun:
             self.figures = self.write_figures(self.title)
 
     def write_figures(self, title: str) -> list[Path]:
-        """Draw what there is to draw, and say which files were written."""
+        """Draw what there is to draw, and return the files that were written."""
         rows, written = self.folder.rows(), []
         if rows:
             written.append(self.folder.path / LEARNING_CURVE)
