@@ -1,5 +1,7 @@
 """Planners by name."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -38,13 +40,13 @@ def test_a_ready_made_planner_has_its_settings():
 
 
 def test_an_unknown_name_is_answered_with_those_there_are(registered):
-    with pytest.raises(ValueError, match=r"'icem'.*\['cem', 'random-shooting'\]"):
+    with pytest.raises(ValueError, match=r"planner 'icem'.*\['cem', 'random-shooting'\]"):
         make_planner("icem", SPACE)
 
 
 @pytest.mark.parametrize("given", [None, 3, torch.zeros(2)])
 def test_what_makes_no_planner_is_refused(given, unchecked):
-    with pytest.raises(TypeError, match="a planner is given by name"):
+    with pytest.raises(TypeError, match=re.escape(repr(given))):
         make_planner(given, SPACE)
 
 
@@ -55,16 +57,16 @@ def test_a_setting_that_the_planner_does_not_have():
 
 @pytest.mark.parametrize("name", ["", "CEM", "a b", "-a", "a-", "3d", "a--b", "a.b", "../a"])
 def test_names_are_words(name):
-    with pytest.raises(ValueError, match="lower-case words"):
+    with pytest.raises(ValueError, match=f"name .*{re.escape(repr(name))}"):
         register_planner(name, RandomShooting)
 
 
 def test_a_name_has_one_planner(registered):
     register_planner("random-shooting", RandomShooting)  # again, as when a module is run twice
-    with pytest.raises(ValueError, match="'cem' is taken"):
+    with pytest.raises(ValueError, match=r"'cem'.*CEM"):
         register_planner("cem", RandomShooting)
 
 
 def test_a_factory_can_be_called(registered, unchecked):
-    with pytest.raises(TypeError, match="factory"):
+    with pytest.raises(TypeError, match=r"factory .*None"):
         register_planner("nothing", None)
