@@ -189,8 +189,8 @@ def test_what_a_planner_returns_is_checked(actions, message):
         control.act(TASK, OBSERVATION, control.cold, seeded())
 
 
-def test_a_reward_that_is_never_finite_names_the_observation():
-    task = a_task(lambda observation, action, next_observation: math.nan * next_observation[..., 0])
+def test_returns_that_are_never_finite_name_the_observation():
     control = controller()
+    control.dynamics.draw = lambda *_: lambda observation, action, step: math.nan * observation
     with pytest.raises(PlanningError, match=r"finite.*observation \[0\.5\]"):
-        control.act(task, OBSERVATION, control.cold, seeded())
+        control.act(TASK, OBSERVATION, control.cold, seeded())
