@@ -55,4 +55,4 @@ def make(env_id: str, *, render: bool) -> gymnasium.Env:
         return gymnasium.make(env_id, render_mode="rgb_array") if render else gymnasium.make(env_id)
     except ModuleNotFoundError as error:
         module = error.name or env_id.partition(":")[0]
-        raise ValueError(f"the environment {env_id} needs the Python module {module}, which is missing") from error
+        raise ValueError(f"the environment {env_id} needs the Python module {module}: install it") from error

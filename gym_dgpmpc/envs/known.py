@@ -61,7 +61,7 @@ def find(env: gym.Env | EnvSpec) -> KnownTask | None:
 
     Nothing is known about an environment whose class is only derived from one of these, whose MuJoCo model was replaced
     (``xml_file``), or that stands under a wrapper that may change what its numbers mean: any that has a `step` of its
-    own, but for `HARMLESS_WRAPPERS` and those that say so by an attribute ``keeps_task = True``.
+    own, but for `HARMLESS_WRAPPERS` and those that have an attribute ``keeps_task = True``.
 
     Args:
         env: the environment with its wrappers, or the spec to make it from. If its wrappers do not record how they

@@ -151,7 +151,9 @@ class RunFolder:
         try:
             before = {**self._defaults, **self.read_settings()["settings"]}
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise RunFolderError(f"{self.path} holds an agent, but {SETTINGS_FILE} cannot be read: {error}") from error
+            raise RunFolderError(
+                f"{self.path} holds an agent, but {SETTINGS_FILE} cannot be read ({error}): {self._advice}"
+            ) from error
         differing = [
             f"{name} was {before.get(name)}, now {self.settings.get(name)}"
             for name in sorted({*before, *self.settings})
