@@ -21,9 +21,10 @@ from benchmarks.methods import METHODS, ModelFreeMethod, PlanningMethod, Setting
 from benchmarks.result_files import Actions, Episode, RunKey, RunResult
 from benchmarks.tasks import Task
 from gym_dgpmpc.errors import DGPMPCError, RunInUseError
+from gym_dgpmpc.runs.folder import EPISODES_FILE, EpisodeRow, RunFolder, read_rows
 from gym_dgpmpc.runs.provenance import machine, revision, versions
 from gym_dgpmpc.runs.recording import EpisodeRecorder
-from gym_dgpmpc.runs.run import EPISODES_FILE, EpisodeRow, RunFolder, TrainingRun, read_rows, step_limit
+from gym_dgpmpc.runs.training import TrainingRun, step_limit
 
 CHECKPOINT_EVERY = 250
 """Steps between checkpoints within an episode: the paper's half-cheetah has 1000 an episode, which may take hours."""

@@ -1,4 +1,4 @@
-"""Named errors, so that a caller can tell what went wrong without reading the message."""
+"""Errors by name, so that a caller can handle each kind without reading the message."""
 
 
 class DGPMPCError(Exception):
@@ -6,7 +6,7 @@ class DGPMPCError(Exception):
 
 
 class PlanningError(DGPMPCError, RuntimeError):
-    """No candidate action sequence had a finite score, or a planner returned what is no plan of its own."""
+    """No candidate action sequence had a finite score, or a planner returned something else than a plan of its own."""
 
 
 class EnvironmentDataError(DGPMPCError, ValueError):

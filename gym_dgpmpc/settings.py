@@ -15,10 +15,10 @@ from typing import Any
 from gym_dgpmpc.checks import closest
 
 GIVEN_BY_THE_AGENT = frozenset({"device", "dtype", "generator"})
-"""Keyword arguments of parts that are no settings of theirs: the agent has them already."""
+"""Keyword arguments of parts that are not settings: the agent provides them."""
 
 LARGEST_NUMBER = 10**7
-"""No number in a file may exceed this, unless its part says otherwise, so that none takes up the memory."""
+"""No number in a file may exceed this unless its part says otherwise, so that a damaged file cannot fill the memory."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Setting:
     is_saved: bool = True
 
     def parameter(self, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
-        """As part of a signature, with another default if one is given."""
+        """The parameter of a signature, with ``default`` in place of its own if one is given."""
         default = self.default if default is inspect.Parameter.empty else default
         return inspect.Parameter(self.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=self.annotation)
 
@@ -87,7 +87,7 @@ def joined(*of_parts: Settings) -> dict[str, Setting]:
     for settings in of_parts:
         twice = sorted(set(together) & set(settings))
         if twice:
-            raise ValueError(f"two parts of one agent have settings of the same name: {twice}; rename one of them")
+            raise ValueError(f"two parts of one agent have settings of the same name, {twice}: rename them in one part")
         together |= settings
     return together
 

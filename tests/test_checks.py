@@ -16,13 +16,13 @@ def test_counts_of_any_integer_type():
 
 @pytest.mark.parametrize("value", ["2", 2.0, True, None, np.float32(3)])
 def test_what_is_no_whole_number(value):
-    with pytest.raises(TypeError, match=re.escape(f"size must be a whole number, got {value!r}")):
+    with pytest.raises(TypeError, match=rf"size .*{re.escape(repr(value))}$"):
         check_counts(size=value)
 
 
 @pytest.mark.parametrize("value", [0, -3])
 def test_less_than_one(value):
-    with pytest.raises(ValueError, match=f"size must be at least 1, got {value}"):
+    with pytest.raises(ValueError, match=f"size .*{value}$"):
         check_counts(size=value)
 
 
@@ -32,10 +32,10 @@ def test_less_than_one(value):
      ("first_training_iterations", 1e1)],
 )  # fmt: skip
 def test_an_agent_refuses_them_when_it_is_made(name, value, unchecked):
-    with pytest.raises(TypeError, match=f"{name} must be a whole number, got {value!r}"):
+    with pytest.raises(TypeError, match=rf"{name} .*{re.escape(repr(value))}$"):
         DGPMPCAgent(KnownPointMass(), **{name: value})
 
 
 def test_a_time_budget_that_is_no_number(unchecked):
-    with pytest.raises(ValueError, match=r"time_budget must be a positive number of seconds, or None, got .0\.04"):
+    with pytest.raises(ValueError, match=r"time_budget .*'0\.04'$"):
         DGPMPCAgent(KnownPointMass(), time_budget="0.04")

@@ -12,7 +12,7 @@ METRIC = "metric."
 """Before the names of the planner's own metrics in `EpisodeRecord.state_dict`."""
 
 COMMON = ("expected_return", "predicted_reward_per_step", "obtained_reward_per_step", "num_nonfinite", "num_late")
-"""What is logged as ``planner/<name>`` whatever the planner is; its own metrics have other names."""
+"""Names logged as ``planner/<name>`` for every planner; a planner's own metrics must have others."""
 
 
 class EpisodeRecord:
@@ -38,11 +38,11 @@ class EpisodeRecord:
         """A plan made before the step whose reward is added next.
 
         Raises:
-            ValueError: a metric of the planner has a name that is logged of every planner.
+            ValueError: a metric of the planner has the name of a value that is logged for every planner.
         """
         taken = [name for name in info.metrics if name in COMMON]
         if taken:
-            raise ValueError(f"a planner's metrics must have other names than {COMMON}, got {taken}")
+            raise ValueError(f"a planner's metrics must not have the names {COMMON}, got {taken}")
         self.plans.append(info)
         self.plan_steps.append(len(self.rewards))
         self.plan_seconds.append(seconds)
@@ -95,7 +95,7 @@ class EpisodeRecord:
         return metrics
 
     def _means_of_metrics(self) -> dict[str, float]:
-        """Of each metric of the planner, the mean over the plans that have it; NaN is not one."""
+        """The mean of each metric of the planner over the plans that have it; NaN counts as missing."""
         known: dict[str, list[float]] = {}
         for info in self.plans:
             for name, value in info.metrics.items():
@@ -132,7 +132,7 @@ class EpisodeRecord:
         }
 
     def _metric_columns(self) -> dict[str, Tensor]:
-        """Each metric of the planner, one number per plan; NaN where a plan has none of that name."""
+        """Each metric of the planner, one number per plan; NaN where a plan lacks it."""
         names = sorted({name for info in self.plans for name in info.metrics})
         return {
             METRIC + name: torch.tensor(
@@ -151,7 +151,9 @@ class EpisodeRecord:
         counts = {size for column in columns.values() for size in column.shape}
         counts |= {*state["plan_steps"].shape, *state["plan_seconds"].shape}
         if len(counts) != 1 or state["rewards"].ndim != 1:
-            raise ValueError(f"an episode's record has plans of different counts: {counts}")
+            raise ValueError(
+                f"an episode's record must have one entry per plan, got different counts: {sorted(counts)}"
+            )
         self.rewards = state["rewards"].tolist()
         returns, nonfinite = columns.pop("expected_return").tolist(), columns.pop("num_nonfinite").tolist()
         metrics = {name.removeprefix(METRIC): column.tolist() for name, column in columns.items()}

@@ -16,17 +16,17 @@ EXIT_ERROR, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 130, 143
 
 @contextmanager
 def one_line_errors(*expected: type[Exception]) -> Iterator[None]:
-    """Report this package's errors, Gymnasium's and the ``expected`` ones in one line; others are bugs."""
+    """Report this package's errors, Gymnasium's and those of the ``expected`` types in one line; others are bugs."""
     kinds: tuple[type[Exception], ...] = (DGPMPCError, gymnasium.error.Error, *expected)
     try:
         yield
     except kinds as error:
-        typer.echo(f"error: {' '.join(str(error).split()) or _where(error)}", err=True)
+        typer.echo(f"error: {' '.join(str(error).split()) or _kind_and_place(error)}", err=True)
         raise typer.Exit(EXIT_ERROR) from error
 
 
-def _where(error: Exception) -> str:
-    """Kind and place of an error that says nothing, such as a bare assertion in an environment."""
+def _kind_and_place(error: Exception) -> str:
+    """Kind and place of an error without a message, such as a bare assertion in an environment."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__} at {last.filename}:{last.lineno}: {last.line}"
 
@@ -38,7 +38,7 @@ def use_threads(threads: int) -> None:
 
 
 def prepare_video(env_id: str) -> str:
-    """Choose MuJoCo's way to draw off-screen, before MuJoCo is used; the result says why there is none, if so."""
+    """Choose how MuJoCo draws off-screen, before it does; returns why it cannot, or an empty text."""
     from gym_dgpmpc.runs.rendering import probe_rendering
 
     make(env_id, render=False).close()  # so that a mistake in the id is not taken for a missing OpenGL
@@ -50,9 +50,9 @@ def prepare_video(env_id: str) -> str:
 
 def make(env_id: str, *, render: bool) -> gymnasium.Env:
     if ":" in env_id and os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())  # a module of the user's own lies here, as for `python -m`
+        sys.path.insert(0, os.getcwd())  # the user's own module may lie here, as for `python -m`
     try:
         return gymnasium.make(env_id, render_mode="rgb_array") if render else gymnasium.make(env_id)
     except ModuleNotFoundError as error:
         module = error.name or env_id.partition(":")[0]
-        raise ValueError(f"the environment {env_id} needs the Python module {module}, which is missing") from error
+        raise ValueError(f"the environment {env_id} needs the Python module {module}: install it") from error

@@ -9,14 +9,14 @@ from gym_dgpmpc.cli.common import make, one_line_errors, prepare_video, use_thre
 
 
 def evaluate(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="A folder of `dgpmpc train`, or an agent's file.")],
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="Folder written by `dgpmpc train`, or an agent's file.")],
     env_id: Annotated[
         str | None,
         typer.Option(
             "--env",
             metavar="ENV_ID",
-            help="Gymnasium id of an environment of the same spaces.",
-            show_default="the one trained in",
+            help="Gymnasium id of an environment with the same spaces.",
+            show_default="the one it was trained in",
         ),
     ] = None,
     episodes: Annotated[int, typer.Option(min=1, help="Episodes to play.")] = 3,

@@ -20,22 +20,22 @@ from gym_dgpmpc.settings import Setting, settings_of
 from gym_dgpmpc.tasks.functions import LEARNED
 
 SET_BY_THE_RUN = {"seed", "verbose", "tensorboard_log", "stats_window_size", "observation_spec"}
-"""Settings of the agent that are no options: the run has them, or they are not plain values."""
+"""Settings of the agent that are not options: the run has them, or they are not plain values."""
 
-PLANNER_TEXT = "The optimiser of action sequences."
+PLANNER_TEXT = "Planner, which optimises action sequences."
 SOURCE_TEXTS = {
-    "reward_fn": "Whether the model learns to predict the reward, even where it is known.",
-    "terminated_fn": "Whether the model learns to predict an episode's end, even where it is known.",
+    "reward_fn": "Let the model learn the reward, even where it is known.",
+    "terminated_fn": "Let the model learn when an episode ends, even where it is known.",
 }
 CHOICES = {"kernel": tuple(KERNELS)}
-"""What a setting may be whose annotation does not say it."""
+"""The values of settings whose annotation does not list them."""
 
 
 def with_settings(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with an option for each setting; it is called with those, by name, in its ``asked``."""
+    """The command with an option for each setting; their values are passed to it by name, as ``asked``."""
 
     def with_options(**given: Any) -> None:
-        asked = {name: _plain(given.pop(name)) for name in names}
+        asked = {name: _plain_value(given.pop(name)) for name in names}
         command(**given, asked=asked)
 
     own = [p for p in inspect.signature(command).parameters.values() if p.name != "asked"]
@@ -57,10 +57,10 @@ def _options() -> Iterable[inspect.Parameter]:
     yield _option("planner", _choice("planner", tuple(PLANNERS)), PLANNER_TEXT, "cem", "Planner")
     for panel, settings in groups:
         for setting in settings.values():
-            kind = _kind(setting)
+            kind = _option_type(setting)
             if setting.name not in seen | SET_BY_THE_RUN and kind is not None:
                 seen.add(setting.name)
-                yield _option(setting.name, kind, setting.text, _default(setting), panel)
+                yield _option(setting.name, kind, setting.text, _default_text(setting), panel)
     for name, text in SOURCE_TEXTS.items():
         yield _option(name, _choice(name, (LEARNED,)), text, "what is known; else learned", "Task")
 
@@ -79,7 +79,7 @@ def _option(name: str, kind: Any, text: str, default: str | bool, panel: str) ->
     )
 
 
-def _kind(setting: Setting) -> Any:
+def _option_type(setting: Setting) -> Any:
     """The type of an option, or None if the setting is not a plain value."""
     if setting.name in CHOICES:
         return _choice(setting.name, CHOICES[setting.name])
@@ -96,12 +96,12 @@ def _choice(name: str, choices: Iterable[str]) -> Any:
     return Enum(name, {choice: choice for choice in choices}, type=str)
 
 
-def _default(setting: Setting) -> str | bool:
-    """What holds if the option is not given, for a person; False where the text says it."""
+def _default_text(setting: Setting) -> str | bool:
+    """The text of the default; False where the option's own text says it."""
     is_preset = any(setting.name in preset for preset in (*presets.PAPER.values(), *presets.STOCK.values()))
     texts = [] if setting.default is None else [str(setting.default)]
     return " or ".join([*texts, *(["the preset's for ENV_ID"] if is_preset else [])]) or False
 
 
-def _plain(value: Any) -> Any:
+def _plain_value(value: Any) -> Any:
     return value.value if isinstance(value, Enum) else value

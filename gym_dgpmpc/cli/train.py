@@ -20,7 +20,7 @@ from gym_dgpmpc.cli.common import (
 from gym_dgpmpc.settings import refuse_unknown
 
 if TYPE_CHECKING:
-    from gym_dgpmpc.runs.run import TrainingRun
+    from gym_dgpmpc.runs.training import TrainingRun
 
 DEFAULT_EPISODES = 15
 RUN = "Run"
@@ -33,19 +33,19 @@ def train(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the results. A run that it holds goes on where it was interrupted.",
+            help="Folder for the results. An interrupted run in it goes on.",
             show_default="runs/ENV_ID-seedSEED",
             rich_help_panel=RUN,
         ),
     ] = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Begin anew where the folder holds a run.", rich_help_panel=RUN)
+        bool, typer.Option("--overwrite", help="Start anew and delete the run in the folder.", rich_help_panel=RUN)
     ] = False,
     episodes: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="Planned episodes; the random ones come before.",
+            help="Planned episodes, after those with random actions.",
             show_default=str(DEFAULT_EPISODES),
             rich_help_panel=RUN,
         ),
@@ -53,11 +53,11 @@ def train(
     timesteps: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Environment steps in all, the random ones too; instead of --episodes.", rich_help_panel=RUN
+            min=1, help="Environment steps in all, random ones included; instead of --episodes.", rich_help_panel=RUN
         ),
     ] = None,
     seed: Annotated[
-        int, typer.Option(min=0, help="Decides everything random, the environment included.", rich_help_panel=RUN)
+        int, typer.Option(min=0, help="Seed of everything random, the environment included.", rich_help_panel=RUN)
     ] = 0,
     threads: Annotated[
         int,
@@ -66,24 +66,25 @@ def train(
     progress: Annotated[
         bool | None,
         typer.Option(
-            "--progress/--no-progress", help="A progress bar.", show_default="on a terminal", rich_help_panel=RUN
+            "--progress/--no-progress", help="Show a progress bar.", show_default="on a terminal", rich_help_panel=RUN
         ),
     ] = None,
     video: Annotated[
-        bool, typer.Option("--video/--no-video", help="A GIF of the last episode; needs OpenGL.", rich_help_panel=RUN)
+        bool,
+        typer.Option("--video/--no-video", help="Write a GIF of the last episode; needs OpenGL.", rich_help_panel=RUN),
     ] = True,
     checkpoint_every: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Steps between checkpoints within an episode, beside those at its end.", rich_help_panel=RUN
+            min=1, help="Steps between checkpoints within an episode, besides the one at its end.", rich_help_panel=RUN
         ),
     ] = None,
     *,
     asked: dict[str, Any],
 ) -> None:
-    """Train an agent, and leave results, pictures and the agent itself in a folder.
+    """Train an agent, and write its results, pictures and the agent itself to a folder.
 
-    Options that are not given are as in the preset for ENV_ID (the paper's if it has one), else the agent's defaults.
+    Options that you leave out come from the preset for ENV_ID, if there is one, else from the agent's defaults.
     """
     with one_line_errors(ValueError, TypeError):
         arguments = _fill_in(env_id, {**asked, "seed": seed})
@@ -95,7 +96,7 @@ def train(
         env = make(env_id, render=not no_video)
         run = _set_up_run(env, arguments, out, overwrite, episodes, timesteps, checkpoint_every)
     if run.is_complete:
-        typer.echo(f"{run.folder.path} holds this run already, finished: ask for more --episodes, or --overwrite it")
+        typer.echo(f"the run in {run.folder.path} has finished: ask for more --episodes, or --overwrite it")
         return
     if run.folder.goes_on:
         typer.echo(f"{run.folder.path} goes on after step {run.agent.num_timesteps}")
@@ -128,13 +129,14 @@ def _set_up_run(
 ) -> "TrainingRun":
     """The run that the options describe."""
     from gym_dgpmpc.agents import DGPMPCAgent
-    from gym_dgpmpc.runs.run import RunFolder, TrainingRun, step_limit
+    from gym_dgpmpc.runs.folder import RunFolder
+    from gym_dgpmpc.runs.training import TrainingRun, step_limit
 
     assert env.spec is not None
     env_id, max_steps = env.spec.id, env.spec.max_episode_steps
     if timesteps is None:
         if max_steps is None:
-            raise ValueError(f"episodes of {env_id} have no time limit and may never end: give --timesteps")
+            raise ValueError(f"episodes of {env_id} have no time limit, so they may never end: give --timesteps")
         episodes = episodes or DEFAULT_EPISODES
         timesteps = step_limit(episodes, max_steps, arguments["learning_starts"])
     folder = RunFolder(
@@ -161,10 +163,10 @@ def _set_up_run(
 
 
 def _fill_in(env_id: str, asked: dict[str, Any]) -> dict[str, Any]:
-    """Every argument as asked, else as in the preset for the environment, else as the agent has it.
+    """Every argument: as given, else from the preset for the environment, else the agent's default.
 
     Raises:
-        TypeError: a setting of another planner is asked for.
+        TypeError: a setting that the agent with this planner does not have was given.
     """
     from gym_dgpmpc.agents import DGPMPCAgent
     from gym_dgpmpc.agents.presets import settings_for
@@ -182,7 +184,7 @@ def _fill_in(env_id: str, asked: dict[str, Any]) -> dict[str, Any]:
 
 
 def _identifying(arguments: dict[str, Any]) -> dict[str, Any]:
-    """The arguments that make a run another one: not those that the machine decides."""
+    """The arguments that tell one run from another; settings that depend on the machine do not."""
     from gym_dgpmpc.agents import DGPMPCAgent
 
     settings = DGPMPCAgent.part_settings(arguments["planner"])

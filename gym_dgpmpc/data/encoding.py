@@ -2,7 +2,7 @@
 
 Sits between the transition store and every dynamics model. An `ObservationSpec` decides it: angles become sine and
 cosine (a stationary kernel then sees that 0 and 2 pi are one place), vectors are turned into the body's frame, changes
-are predicted rather than values unless a dimension is absolute, constant dimensions are not modelled at all.
+are predicted rather than values unless a dimension is absolute, and constant dimensions are not modelled at all.
 """
 
 import math
@@ -50,8 +50,8 @@ class Encoder:
     The way back from a target is in `dynamics/coordinates.py`.
 
     Inputs are ordered: the plain dimensions in the order of the observation, then sines, then cosines of the angles,
-    then the action. Targets are the non-constant dimensions in the order of the observation. Of a vector in
-    ``body_frame``, x is forwards and y to the left of the body in both, under the heading before the step.
+    then the action. Targets are the non-constant dimensions in the order of the observation. In both, the x
+    and y of a vector in ``body_frame`` point forwards and to the left of the body, under the heading before the step.
 
     Args:
         observation_size: S.
@@ -80,11 +80,11 @@ class Encoder:
         self.angles = [i for i in fed if i in spec.angles]
         self.predicted = [i for i in range(observation_size) if i not in spec.constant]
         if not self.predicted:
-            raise ValueError(f"nothing is left to predict: all {observation_size} dimensions are constant in {spec}")
+            raise ValueError(f"nothing is left to predict: all {observation_size} dimensions are constant, got {spec}")
         self.input_size = len(self.plain) + 2 * len(self.angles) + action_size
         self.target_size = len(self.predicted)
         if not self.input_size:
-            raise ValueError(f"nothing is left to feed: there is no action, and not_inputs is everything in {spec}")
+            raise ValueError(f"nothing is left to feed: there is no action, and not_inputs is everything, got {spec}")
         self.carried = torch.tensor(
             [float(i in spec.constant or i not in spec.absolute) for i in range(observation_size)]
         )
@@ -106,7 +106,7 @@ class Encoder:
     def targets(
         self, observation: Float[Tensor, "*b S"], next_observation: Float[Tensor, "*b S"]
     ) -> Float[Tensor, "*b T"]:
-        """What the model predicts: the change (of an angle: the smaller way round), or the value if absolute."""
+        """What the model predicts: the change (for an angle, the smaller way round), or the value if absolute."""
         before, after = observation[..., self.predicted], next_observation[..., self.predicted]
         target = torch.where(self._is_change.to(after.device), after - before, after)
         if bool(self._wraps.any()):
@@ -145,14 +145,16 @@ def _check_body_frame(observation_size: int, spec: ObservationSpec) -> None:
     components = [i for _, *vector in spec.body_frame for i in vector]
     if len(set(components)) != len(components) or headings.intersection(components):
         raise ValueError(
-            f"{what} vectors that share no index with another or with a heading, received {spec.body_frame}"
+            f"{what} vectors that share no index with each other or with a heading, received {spec.body_frame}"
         )
     for _, x, y in spec.body_frame:
         for name in ("absolute", "not_inputs", "constant"):
             if (x in getattr(spec, name)) != (y in getattr(spec, name)):
                 raise ValueError(
-                    f"a vector is turned as a whole: {x} and {y} must be both or neither in ObservationSpec.{name}, "
+                    f"ObservationSpec.{name} must hold both or neither of {x} and {y}, a vector of body_frame, "
                     f"received {getattr(spec, name)}"
                 )
         if x in spec.angles or y in spec.angles:
-            raise ValueError(f"{x} and {y} are a vector, not angles: ObservationSpec.angles received {spec.angles}")
+            raise ValueError(
+                f"ObservationSpec.angles must not hold {x} or {y}, a vector of body_frame, received {spec.angles}"
+            )

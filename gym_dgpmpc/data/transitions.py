@@ -1,6 +1,6 @@
 """The store of everything observed: validated at the door, float32, growing without limit.
 
-Rows are copied in, and handed out as views. A buffer that is full is replaced by one of twice the size, so adding a
+Rows are copied in and handed out as views. A buffer that is full is replaced by one of twice the size, so adding a
 row costs a constant on average.
 """
 
@@ -19,7 +19,7 @@ from gym_dgpmpc.types import StateDict, Transitions
 class TransitionStore:
     """The transitions of all episodes, in the order in which they were performed.
 
-    Nothing is stored of a batch that is refused, so what was gathered before is never lost to a bad observation.
+    A batch that is refused leaves the store as it was, so a bad observation never costs what was gathered before.
 
     Args:
         observation_size: S.
@@ -117,7 +117,9 @@ class TransitionStore:
             CheckpointError: a field is missing or unknown, or does not fit the sizes of this store.
         """
         if set(state) != set(self._buffers):
-            raise CheckpointError(f"stored transitions have fields {sorted(self._buffers)}, got {sorted(state)}")
+            raise CheckpointError(
+                f"stored transitions must have the fields {sorted(self._buffers)}, got {sorted(state)}"
+            )
         fields = []
         for name in self._buffers:
             value = state[name]
@@ -146,7 +148,7 @@ class TransitionStore:
         self._length += count
 
     def _converted(self, name: str, value: np.ndarray, count: int) -> np.ndarray:
-        """``value`` in the buffer's dtype, or the error that says at which step what is wrong with it."""
+        """``value`` in the buffer's dtype, or an error that names the step, the field and what is wrong."""
         buffer = self._buffers[name]
         expected = (count, *buffer.shape[1:])
         if value.shape != expected:

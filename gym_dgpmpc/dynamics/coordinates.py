@@ -19,12 +19,12 @@ class Coordinates:
         encoder: what is fed and predicted.
         inputs: standardisation of the encoded inputs, size D.
         targets: standardisation of the targets, size T.
-        dtype: precision of the rollout, whatever that of the states that come in; those that go out have theirs.
+        dtype: precision of the rollout; states come in and go out in any other.
 
     Attributes:
         input_mean, input_scale: of the encoded inputs, [D].
-        carried, shift: the next state is carried * state + shift + what the targets add to it, [S] each; the latter two
-            along the body's axes where a vector is in ``body_frame``.
+        carried, shift: the next state is carried * state + shift + what the targets add to it, [S] each. The latter two
+            are along the body's axes for a vector in ``body_frame``.
         spread: what one unit of each standardised target adds to its dimension of the state, [T].
     """
 

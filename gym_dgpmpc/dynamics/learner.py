@@ -1,4 +1,4 @@
-"""What the models that are fitted to encoded transitions have in common: the encoding, and being fitted or not."""
+"""The base of models that are fitted to encoded transitions: the encoding, and whether there was a fit yet."""
 
 from typing import Generic, TypeVar
 
@@ -61,5 +61,5 @@ class Learner(Generic[Fitted]):
 
     def _require_fit(self, verb: str) -> Fitted:
         if self._fitted is None:
-            raise RuntimeError(f"cannot {verb}: the dynamics model has not been fitted to any data yet")
+            raise RuntimeError(f"cannot {verb}: the dynamics model has not been fitted yet, call fit first")
         return self._fitted

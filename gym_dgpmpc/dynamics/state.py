@@ -1,11 +1,11 @@
 """Saved states: every entry is checked for its name, its type and its shape before anything is replaced."""
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
 from gym_dgpmpc.data.normaliser import Normaliser
-from gym_dgpmpc.gp.kernels import Kernel
-from gym_dgpmpc.gp.layer import PARAMETERS, Layer
 from gym_dgpmpc.types import StateDict
 
 
@@ -19,13 +19,29 @@ def take_tensor(
     """A copy of the entry ``name``.
 
     Raises:
-        ValueError: it is missing, is no tensor, or has another shape.
+        ValueError: it is missing, is not a tensor, or has another shape.
     """
     value = state.get(name)
     received = tuple(value.shape) if isinstance(value, Tensor) else value
     if not isinstance(value, Tensor) or value.shape != shape:
         raise ValueError(f"dynamics state {name!r}: expected a tensor of shape {shape}, received {received}")
     return value.to(device, dtype).clone()
+
+
+def take_tensors(
+    state: StateDict,
+    shapes: Mapping[str, tuple[int, ...]],
+    device: torch.device,
+    dtype: torch.dtype = torch.float64,
+    *,
+    prefix: str = "",
+) -> dict[str, Tensor]:
+    """Copies of the entries whose names are ``prefix`` and one of those in ``shapes``, by the latter.
+
+    Raises:
+        ValueError: as `take_tensor`.
+    """
+    return {name: take_tensor(state, f"{prefix}{name}", shape, device, dtype) for name, shape in shapes.items()}
 
 
 def normalisers_state(inputs: Normaliser, targets: Normaliser) -> StateDict:
@@ -40,17 +56,4 @@ def take_normaliser(state: StateDict, name: str, size: int, device: torch.device
     Raises:
         ValueError: as `take_tensor`.
     """
-    return Normaliser(*(take_tensor(state, f"{name}.{key}", (size,), device) for key in Normaliser._fields))
-
-
-def take_layer(
-    state: StateDict, prefix: str, kernel: Kernel, num_inducing: int, input_size: int, device: torch.device
-) -> Layer:
-    """The layer with this kernel whose entries begin with ``prefix``.
-
-    Raises:
-        ValueError: as `take_tensor`.
-    """
-    shapes = ((num_inducing, input_size), (input_size,), ())
-    fields = zip(PARAMETERS, shapes, strict=True)
-    return Layer(kernel, *(take_tensor(state, f"{prefix}{name}", shape, device) for name, shape in fields))
+    return Normaliser(**take_tensors(state, dict.fromkeys(Normaliser._fields, (size,)), device, prefix=f"{name}."))

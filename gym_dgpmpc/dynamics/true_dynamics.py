@@ -33,11 +33,11 @@ class TrueDynamics:
         self.simulator = Simulator(env)
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
-        """Nothing."""
+        """Do nothing: there is nothing to fit."""
         return {}
 
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
-        """Nothing."""
+        """Do nothing: there is nothing to fit."""
         return {}
 
     def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
@@ -49,13 +49,13 @@ class TrueDynamics:
         return {}
 
     def load_state_dict(self, state: StateDict) -> None:
-        """Nothing.
+        """Accept an empty state.
 
         Raises:
             ValueError: the state is another model's.
         """
         if state:
-            raise ValueError(f"the true dynamics have no state, received {sorted(state)}")
+            raise ValueError(f"the true dynamics must have an empty state, received one with {sorted(state)}")
 
 
 class SimulatorSampler:

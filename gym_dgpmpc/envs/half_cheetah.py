@@ -30,7 +30,7 @@ CAMERA: dict[str, Any] = {
     "azimuth": 90.0,
     "elevation": -8.0,
 }
-"""Of the window; pictures are taken by the model's own camera, which follows too."""
+"""The camera of the window. Pictures are taken by the model's own camera, which follows too."""
 
 
 class HalfCheetahRewardTerms(NamedTuple):
@@ -78,7 +78,7 @@ class VelocityHalfCheetahEnv(MujocoTask, utils.EzPickle):
     ## Description
     A flat runner with a back leg and a front leg of three joints each moves in a vertical plane on a floor. Torques on
     its six joints, which springs draw back to their rest, should make it run forwards. It weighs 14 kg and is the one
-    of Gymnasium's `HalfCheetah-v5`, whose reward cannot be told from its observation. Here the observation begins with
+    of Gymnasium's `HalfCheetah-v5`, whose reward is not a function of its observation. Here the observation begins with
     the velocity that is rewarded.
 
     ## Action space
@@ -118,7 +118,7 @@ class VelocityHalfCheetahEnv(MujocoTask, utils.EzPickle):
     | 17  | Rate of the front foot                             | -inf | inf | hinge (front_foot)        | rad/s |
 
     The first number is 0 after a reset. For a model (`observation_spec`) the pitch is an angle; the first number is
-    predicted as it is and is no input, because it belongs to the step before.
+    predicted as it is and is not an input, because it belongs to the step before.
 
     ## Reward
     The reward of a step is *velocity - control_cost*, evaluated on the state that the step leads to:
@@ -219,7 +219,7 @@ class VelocityHalfCheetahEnv(MujocoTask, utils.EzPickle):
 def make_risk_sensitive_half_cheetah(penalise_step: bool = False, **kwargs: Any) -> gym.Env:
     """`RiskSensitiveHalfCheetah-v0`: `VelocityHalfCheetahEnv` under `RiskSensitiveReward`, as in the paper.
 
-    Planned with is the reward less floor(|pitch| / 20 degrees); reported, by default, is the reward without it.
+    Plans use the reward less floor(|pitch| / 20 degrees); by default, `step` reports the reward without the penalty.
 
     Args:
         penalise_step: let `step` return the penalised reward too, for agents without a model.
@@ -228,5 +228,5 @@ def make_risk_sensitive_half_cheetah(penalise_step: bool = False, **kwargs: Any)
     return RiskSensitiveReward(VelocityHalfCheetahEnv(**kwargs), angle_index=PITCH, penalise_step=penalise_step)
 
 
-# As on a class: tells `gymnasium.make` which other modes it can make of these, such as "rgb_array_list".
+# As on a class: `gymnasium.make` reads here which other modes it can derive, such as "rgb_array_list".
 make_risk_sensitive_half_cheetah.metadata = VelocityHalfCheetahEnv.metadata  # type: ignore[attr-defined]

@@ -1,8 +1,8 @@
-"""What is known of Gymnasium's own continuous-control tasks: reward, termination, how to read the observation.
+"""What is known about Gymnasium's own continuous-control tasks: reward, termination, how to read the observation.
 
 `find` looks an environment up. The functions are those of the environments' own `step`, as functions of (observation,
 action, next observation), with the weights and ranges that the environment was made with. docs/environments.md has a
-table of what is known of which task, and of what must be learned.
+table of what is known about which task, and what must be learned.
 """
 
 from collections.abc import Callable
@@ -44,7 +44,7 @@ MONITOR = f"{Monitor.__module__}:{Monitor.__qualname__}"
 
 
 class KnownTask(NamedTuple):
-    """What is known of an environment."""
+    """What is known about an environment."""
 
     reward_fn: RewardFn | None
     """None: the reward is not a function of observation, action and next observation, and must be learned."""
@@ -52,20 +52,20 @@ class KnownTask(NamedTuple):
     """None: an episode never terminates. Where it does, the termination of every task here is known."""
     observation_spec: ObservationSpec
     planning_reward_fn: RewardFn | None = None
-    """What to plan with instead: where ``reward_fn`` tells too late, for a plan's horizon, that things go wrong, or
+    """What to plan with instead: where ``reward_fn`` shows too late, for a plan's horizon, that things go wrong, or
     where the reward is nearly, but not quite, a function of the observations."""
 
 
 def find(env: gym.Env | EnvSpec) -> KnownTask | None:
-    """What is known of an environment, or None if it is not one of Gymnasium's own.
+    """What is known about an environment, or None if it is not one of Gymnasium's own.
 
-    Nothing is known of an environment whose class is only derived from one of these, whose MuJoCo model was replaced
+    Nothing is known about an environment whose class is only derived from one of these, whose MuJoCo model was replaced
     (``xml_file``), or that stands under a wrapper that may change what its numbers mean: any that has a `step` of its
-    own, but for `HARMLESS_WRAPPERS` and those that say so by an attribute ``keeps_task = True``.
+    own, but for `HARMLESS_WRAPPERS` and those that have an attribute ``keeps_task = True``.
 
     Args:
-        env: the environment with its wrappers, or the spec to make it from; of one whose wrappers do not record how
-            they were made, nothing is known.
+        env: the environment with its wrappers, or the spec to make it from. If its wrappers do not record how they
+            were made, nothing is known.
     """
     if isinstance(env, EnvSpec):
         spec = deepcopy(env)
@@ -90,17 +90,17 @@ def find(env: gym.Env | EnvSpec) -> KnownTask | None:
 
 
 def _may_change_task(wrapper: Any) -> bool:
-    """Whether what is known of an environment may not hold for the wrapped one."""
+    """Whether what is known about an environment may not hold for the wrapped one."""
     keeps_task = isinstance(wrapper, HARMLESS_WRAPPERS) or getattr(type(wrapper), "keeps_task", False)
     # A VecEnv's wrapper always has a step of its own.
     return not keeps_task and getattr(type(wrapper), "step", None) is not gym.Wrapper.step
 
 
 def may_change_observations(wrapper: Any) -> bool:
-    """Whether the observations of an environment may mean something else under this wrapper, of it or of a VecEnv.
+    """Whether observations may mean something else under this wrapper of an environment or a VecEnv.
 
-    So it is with any that has a `step` of its own, but for those that keep the whole task (see `find`), change actions
-    or rewards alone, or say that they leave observations alone by an attribute ``keeps_observations = True``.
+    They may under any wrapper with a `step` of its own. Exceptions: wrappers that keep the whole task (see `find`),
+    that change actions or rewards alone, or that have an attribute ``keeps_observations = True``.
     """
     keeps = isinstance(wrapper, OBSERVATION_KEEPERS) or getattr(type(wrapper), "keeps_observations", False)
     return not keeps and _may_change_task(wrapper)
@@ -145,7 +145,7 @@ def _inverted_double_pendulum(env: Any) -> KnownTask:
 
 
 def _reacher(env: Any) -> KnownTask:
-    """The arm does not feel the target (4, 5), nor does its way to it (8, 9) tell more than its angles do."""
+    """The arm does not feel the target (4, 5), nor does its way to it (8, 9) say more than its angles do."""
     reward = known.PlanarReacherReward(float(env._reward_dist_weight), float(env._reward_control_weight))
     return KnownTask(reward, None, ObservationSpec(not_inputs=(4, 5, 8, 9), constant=(4, 5)))
 
@@ -225,4 +225,4 @@ _TASKS: dict[str, Callable[[Any], KnownTask]] = {
     "gymnasium.envs.mujoco.hopper_v5:HopperEnv": _hopper,
     "gymnasium.envs.mujoco.walker2d_v5:Walker2dEnv": _walker,
 }
-"""The class of the environment, as module:name so that none is imported here -> what is known of an instance."""
+"""The class of the environment, as module:name so that nothing is imported here -> what is known about an instance."""

@@ -1,7 +1,7 @@
 """Rewards and terminations of Gymnasium's own tasks, as batched functions of observation, action, next observation.
 
 Each computes what the environment's `step` does, up to rounding or to what its docstring says. Sizes in the shape
-annotations: S observation, A action, any leading dimensions. None clips the action unless the environment does.
+annotations: S observation, A action, any leading dimensions. The action is clipped only where the environment does so.
 """
 
 from dataclasses import dataclass

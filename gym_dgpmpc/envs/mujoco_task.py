@@ -35,7 +35,7 @@ class MujocoTask(MujocoEnv):
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}  # noqa: RUF012
 
     terminated_fn: TerminatedFn | None = None
-    """None says that an episode never terminates; an environment that did not say so would have no such attribute."""
+    """None means that an episode never terminates. An environment where that is unknown lacks the attribute."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class MujocoTask(MujocoEnv):
     def perform(self, action: NDArray[Any]) -> NDArray[Any]:
         """Simulate one environment step, and return the action as performed: a float array, clipped to the bounds.
 
-        The reward is due for this action and not for the one that was asked for.
+        The reward depends on the clipped action, not on the one that was passed.
 
         Raises:
             ValueError: the action has another shape than the action space, or is not finite.
@@ -153,7 +153,7 @@ def whole(name: str, value: int, least: int = 1) -> int:
 
 
 def point(name: str, value: Sequence[float] | NDArray[Any], what: str, size: int) -> tuple[float, ...]:
-    """The value as a tuple of ``size`` floats; ``what`` it should be is said in the error.
+    """The value as a tuple of ``size`` floats; the error says ``what`` was expected.
 
     Raises:
         ValueError: it is not that many finite numbers.

@@ -133,7 +133,7 @@ class Reacher7DoFEnv(MujocoTask, utils.EzPickle):
     | 16  | Rate of the wrist's roll            | -inf | inf | hinge (wrist_roll)        |                    | rad/s |
 
     The ends of a joint's range are soft. For a model (`observation_spec`) the free rolls are angles, and the target is
-    constant and no input, because the arm does not feel it.
+    constant and not an input, because the arm does not feel it.
 
     ## Reward
     The reward of a step is *-(squared_distance + control_cost)*, evaluated on the state that the step leads to:
@@ -154,8 +154,8 @@ class Reacher7DoFEnv(MujocoTask, utils.EzPickle):
     begins the sequence again; a reset after at least one step goes on to the next episode; a reset before the first
     step repeats it, so that it does not matter how often an agent resets at its start. `reset(options={"episode": k})`
     begins episode k, also where a seed is given: so an interrupted run goes on where it was. The copies in a vector
-    environment have a sequence each, all the same one; give them a `target_seed` each if they should differ. Who seeds
-    every single reset and wants different targets needs `target_seed=None` or the option. Without a `target_seed` the
+    environment have a sequence each, all the same one; give them a `target_seed` each if they should differ. To seed
+    every reset and still meet different targets, use `target_seed=None` or the option. Without a `target_seed` the
     option has no effect.
 
     ## Episode end

@@ -31,15 +31,15 @@ class IntegerJointTypes:
 def is_broken(utilities: Any) -> bool:
     """Whether a module compares joint types with an enumeration in which MuJoCo's numbers are not found.
 
-    Before version 3.12 of MuJoCo they were; since then `np.int32(3) in (mjJNT_HINGE, mjJNT_SLIDE)` is false, by which
-    Gymnasium-Robotics 1.4.2 takes every hinge for none and fails to make a Fetch or Hand environment.
+    Before version 3.12 of MuJoCo they were; since then `np.int32(3) in (mjJNT_HINGE, mjJNT_SLIDE)` is false, so that
+    Gymnasium-Robotics 1.4.2 does not recognise hinges and fails to make a Fetch or Hand environment.
     """
     joint = utilities.mujoco.mjtJoint
     return np.int32(int(joint.mjJNT_HINGE)) not in (joint.mjJNT_HINGE, joint.mjJNT_SLIDE)
 
 
 def use_integer_joint_types(utilities: Any) -> bool:
-    """Let a module of Gymnasium-Robotics compare joint types as integers, if it must; says whether it had to."""
+    """Let a module of Gymnasium-Robotics compare joint types as integers, if it must; returns whether it had to."""
     if not is_broken(utilities):
         return False
     utilities.mujoco = IntegerJointTypes()

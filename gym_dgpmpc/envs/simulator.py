@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class SimulatorLayout:
-    """Where an observation holds the simulator's state. Numbers of it that are named nowhere stay as they are.
+    """Where an observation holds the simulator's state. Numbers that are not named here stay as they are.
 
     Attributes:
-        positions: of each generalised position, its index in the observation, or None where the observation does not
-            tell and the dynamics do not depend on it (how far the half-cheetah has run); it then starts at 0.
-        velocities: of each generalised velocity, its index in the observation.
+        positions: index of every generalised position in the observation. None where the observation lacks it and the
+            dynamics do not depend on it (how far the half-cheetah has run); it then starts at 0.
+        velocities: index of every generalised velocity in the observation.
         rates: pairs (index in the observation, generalised position) of numbers that are the position's mean velocity
             over the last environment step.
     """
@@ -39,7 +39,7 @@ class Simulator:
         env: a MuJoCo environment, wrapped or not; it is neither stepped nor changed.
 
     Raises:
-        ValueError: the environment is none of MuJoCo's, or its observation does not determine the simulator's state.
+        ValueError: the environment is not MuJoCo's, or its observation does not determine the simulator's state.
     """
 
     def __init__(self, env: Any):
@@ -55,7 +55,7 @@ class Simulator:
             layout = SimulatorLayout(tuple(range(model.nq)), tuple(range(model.nq, model.nq + model.nv)))
             if size != model.nq + model.nv:
                 raise ValueError(
-                    f"the observation of {inner!r} has {size} numbers, but its simulator {model.nq} positions and "
+                    f"the observation of {inner!r} has {size} numbers, but its simulator has {model.nq} positions and "
                     f"{model.nv} velocities: give the environment a simulator_layout that says where they are"
                 )
         _check_layout(layout, model, size)

@@ -16,7 +16,7 @@ from torch import Tensor
 from gym_dgpmpc.gp.layer import PARAMETERS, Layer, conditional, factorise
 
 NOISE_FLOOR = 1e-6
-"""Lower bound of the noise variance, in standardised targets: below it single-precision data says nothing."""
+"""Lower bound of the noise variance, in standardised targets; single-precision data cannot resolve less."""
 
 
 class DeepGP(NamedTuple):
@@ -72,7 +72,7 @@ class DeepGP(NamedTuple):
 class Factorised(NamedTuple):
     """A model and L_z of its layers, computed once for all that is done with these hyperparameters.
 
-    Gradients with respect to the hyperparameters are complete without any through the factors; see `layer.project`.
+    Gradients with respect to the hyperparameters need none through the factors; see `layer.project`.
     """
 
     model: DeepGP

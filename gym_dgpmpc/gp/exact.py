@@ -29,7 +29,7 @@ def regression(
     y: Float[Tensor, "N T"],
     x_new: Float[Tensor, "n D"],
 ) -> Gaussians:
-    """Posterior of the T functions at ``x_new``; of the layer only its kernel is used.
+    """Posterior of the T functions at ``x_new``; only the layer's kernel and hyperparameters are used.
 
     mean = k_*x (K_xx + noise I)^-1 y, covariance = k_** - k_*x (K_xx + noise I)^-1 k_x*
     (Rasmussen and Williams 2006, eqs. 2.23 and 2.24).

@@ -69,7 +69,7 @@ class Kernel(ABC):
 
 
 class _Correlation(torch.autograd.Function):
-    """With the slope in closed form no gradient meets the square root in Matern kernels, which is singular at zero."""
+    """k(r^2) with its slope in closed form: no gradient meets the square root of Matern kernels, singular at zero."""
 
     @staticmethod
     def forward(ctx: Any, sqdist: Tensor, kernel: Kernel) -> Tensor:
@@ -205,14 +205,14 @@ class Matern72(Matern):
 
 
 KERNELS: dict[str, Kernel] = {kernel.name: kernel for kernel in (RBF(), Matern72(), Matern52(), Matern32(), Matern12())}
-"""Every kernel by its name, from the smoothest functions to the roughest. One of your own may be put in as well."""
+"""Every kernel by its name, from the smoothest functions to the roughest. You may add your own."""
 
 
 def find_kernel(kernel: str | Kernel) -> Kernel:
-    """The kernel of this name; a kernel itself is given back.
+    """The kernel of this name; a kernel is returned as it is.
 
     Raises:
-        ValueError: there is none; names those there are.
+        ValueError: the name is unknown; the message lists the known ones.
     """
     if isinstance(kernel, Kernel):
         return kernel

@@ -40,6 +40,11 @@ PARAMETERS = ("inducing_inputs", "log_lengthscale", "log_variance")
 """The tensors of a `Layer`, which training moves and states hold; the kernel is a setting."""
 
 
+def parameter_shapes(num_inducing: int, input_size: int) -> dict[str, tuple[int, ...]]:
+    """The shape of each of the `PARAMETERS` of a layer with M inducing inputs of D numbers."""
+    return dict(zip(PARAMETERS, ((num_inducing, input_size), (input_size,), ()), strict=True))
+
+
 def factorise(layer: Layer) -> Float[Tensor, "M M"]:
     """L_z, the lower Cholesky factor of K_zz + jitter.
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gym_dgpmpc.gp.linalg import cholesky
 
-_ELEMENTS_AT_ONCE = 2_000_000  # of the second moments' K M^2, which would not fit in memory all at once
+_ELEMENTS_AT_ONCE = 2_000_000  # elements of the second moments, K M^2 in all, which would not fit in memory at once
 
 
 class Predictor(NamedTuple):
@@ -30,7 +30,7 @@ class Predictor(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """Of f(x) for x ~ N(mean, covariance); the input-output covariance is Cov[x, f] = covariance @ gain."""
+    """Moments of f(x) for x ~ N(mean, covariance); the input-output covariance is Cov[x, f] = covariance @ gain."""
 
     mean: Float[Tensor, "K T"]
     covariance: Float[Tensor, "K T T"]

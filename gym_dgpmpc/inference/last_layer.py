@@ -41,14 +41,14 @@ def last_layer_posterior(
     generator: torch.Generator,
     weight: float = 1.0,
 ) -> LastLayerPosterior:
-    """Bayesian linear regression on a_n = L_z^-1 k_zn with the noise s_n = k_nn - |a_n|^2 + noise of each datum.
+    """Bayesian linear regression on a_n = L_z^-1 k_zn whose datum n has the noise s_n = k_nn - |a_n|^2 + noise.
 
     precision = I + sum_n a_n a_n^T / s_n,  mean = precision^-1 sum_n a_n y_n / s_n, under the likelihood of
     `deep_gp.log_likelihood` and one sample of the inner layers' function values at the data.
 
     Args:
         whitened: flat vector of all layers; its last layer is not used.
-        weight: of each datum, N / n where the rows are a subset of the data.
+        weight: how often each datum counts: N / n where the rows are a subset of the data.
 
     Raises:
         FactorisationError: the precision is not finite, or so large that rounding hides the prior.

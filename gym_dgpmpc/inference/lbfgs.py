@@ -16,7 +16,7 @@ from gym_dgpmpc.gp.layer import Layer
 from gym_dgpmpc.gp.sgpr import collapsed_bound
 
 LENGTHSCALES, VARIANCES, NOISE_VARIANCES = (0.01, 1e3), (1e-4, 1e4), (1e-6, 10.0)
-"""Where hyperparameters are kept, for standardised data: beyond, a factorisation would fail before anything is won."""
+"""Limits of the hyperparameters, for standardised data: beyond them factorisations fail and the bound gains nothing."""
 
 
 class Maximum(NamedTuple):
@@ -32,7 +32,7 @@ def maximise_bound(model: DeepGP, data: Data, max_iterations: int, *, free_induc
 
     Args:
         data: standardised.
-        max_iterations: of L-BFGS; each takes about one evaluation of the bound and its gradient.
+        max_iterations: iterations of L-BFGS; each takes about one evaluation of the bound and its gradient.
         free_inducing_inputs: move the inducing inputs too, instead of the hyperparameters alone.
     """
     (layer,) = model.layers

@@ -29,17 +29,17 @@ class InferenceSettings:
     """Settings of the sampler and the hyperparameter optimiser; `DeepGPDynamics` takes them as keyword arguments.
 
     Attributes:
-        step_size: epsilon of SG-HMC; twice the value of Havasi et al., see docs/deviations.md.
-        decay: m, the friction of SG-HMC.
-        learning_rate: of Adam.
+        step_size: step size of SG-HMC, epsilon; twice the value of Havasi et al., see docs/deviations.md.
+        decay: friction of SG-HMC, m, in [0, 1].
+        learning_rate: learning rate of Adam, for hyperparameters and inducing inputs.
         hyperparameters_every: SG-HMC steps for each Adam step.
-        window_size: number of latest positions the M-step draws from.
-        batch_size: observations per gradient; all of them where there are fewer.
-        gibbs_every: training iterations between two exact draws of the last layer, which each kept sample gets too;
-            0 leaves everything to SG-HMC.
-        gibbs_rows: observations that such a draw is conditioned on; all of them where there are fewer.
-        patience: training stops early once the held-out log likelihood has not improved over this many looks at it,
-            which are ``look_every`` iterations apart; None trains to the end, on all data.
+        window_size: latest SG-HMC positions, one of which is drawn for each Adam step.
+        batch_size: transitions in a minibatch; all of them where there are fewer.
+        gibbs_every: training iterations between two exact draws of the last layer, which each sample of the pool gets
+            too; 0 leaves everything to SG-HMC.
+        gibbs_rows: transitions that an exact draw is conditioned on; all of them where there are fewer.
+        patience: looks in a row without a better held-out log likelihood, after which training stops early; None trains
+            to the end, on all data.
         look_every: iterations between two looks at how training goes.
 
     Raises:
@@ -146,7 +146,7 @@ class MCEM:
         """One SG-HMC step (burn-in, preconditioner adapting), and now and then one Adam step and one exact draw.
 
         Raises:
-            FactorisationError: the hyperparameters have become such that a K_zz cannot be factorised.
+            FactorisationError: with the present hyperparameters a K_zz cannot be factorised.
         """
         settings, num_data = self.settings, self.data.num_rows
         batch = minibatch(self.data, settings.batch_size, generator)

@@ -21,16 +21,16 @@ from gym_dgpmpc.inference.mcem import MCEM, InferenceSettings
 from gym_dgpmpc.inference.sghmc import SGHMCState
 
 MAX_ROLLBACKS = 5
-"""In one training; the last of them trains with 1/32 of the step sizes."""
+"""The most rollbacks in one training; after the last of them the step sizes are 1/32 of the settings."""
 
 EXPLODED = 1e3
-"""A negative log joint per observation this far above the lowest that was seen is a run gone wrong."""
+"""A run whose negative log joint per observation is this far above the lowest seen has diverged."""
 
 MOST_WHITENED = 1e4
-"""A whitened inducing output beyond this is a chain gone wrong."""
+"""A chain with a whitened inducing output beyond this has diverged."""
 
 HELD_OUT = 0.1, 256
-"""Part of the data that early stopping holds out, and the most rows."""
+"""The share of the data that early stopping holds out, and the most rows of it."""
 
 MIN_HELD_OUT = 10
 """With fewer rows their likelihood is too noisy to stop on, and nothing is held out."""
@@ -49,7 +49,7 @@ class Trained(NamedTuple):
     num_iterations: int
     num_rollbacks: int
     settings: InferenceSettings
-    """Those asked for, but for the step sizes if they had to be made smaller."""
+    """Those asked for, with smaller step sizes if training needed them."""
 
 
 class Sampled(NamedTuple):
@@ -78,13 +78,13 @@ def train(
         data: standardised; with early stopping a tenth of it serves to see when to stop.
 
     Raises:
-        TrainingError: training diverged again and again, however small its steps.
+        TrainingError: training diverged again and again, with ever smaller steps.
     """
     held_out = None
     if settings.patience is not None:
-        data, held_out = _split(data, generator)
+        data, held_out = _split_off_held_out(data, generator)
     run = MCEM(model, chain, data, settings)
-    good, best, rollbacks = run.snapshot(), run.evaluate(_copied(generator)), 0
+    good, best, rollbacks = run.snapshot(), run.evaluate(_copy_of(generator)), 0
     best_likelihood, looks_since = -math.inf, 0
     while run.iteration < num_iterations:
         trouble = _advance(run, min(settings.look_every, num_iterations - run.iteration), generator, best)
@@ -93,14 +93,14 @@ def train(
             if rollbacks > MAX_ROLLBACKS:
                 raise TrainingError(
                     f"training diverged {rollbacks} times, the last time after iteration {good.iteration} with the "
-                    f"step size {run.settings.step_size:g}: {trouble}. Data of {data.num_rows} transitions are kept; "
-                    "see whether their values are plausible, or train with a smaller step_size"
+                    f"step size {run.settings.step_size:g}: {trouble}. Check whether the values of the {data.num_rows} "
+                    "transitions are plausible, or train with a smaller step_size"
                 )
             run.restore(good, scale=0.5)
             continue
         good, best = run.snapshot(), min(best, float(run.value))
         if held_out is not None:
-            positions = _drawn_rows(run.window, generator)
+            positions = _draw_positions(run.window, generator)
             likelihood = predictive_log_likelihood(factorise_all(run.model), positions, held_out, generator)
             improved = likelihood > best_likelihood
             best_likelihood = max(best_likelihood, likelihood)
@@ -124,12 +124,12 @@ def sample_pool(
     Begins anew with half the step size if the chain leaves what is plausible.
 
     Raises:
-        TrainingError: it did so again and again, however small its steps.
+        TrainingError: it did so again and again, with ever smaller steps.
     """
     for _ in range(MAX_ROLLBACKS + 1):
         # Of the states in between only the positions are kept: a state is several times as large.
         positions, last = [], chain
-        with suppress(FactorisationError):  # of an exact draw: the steps before it led to what is not finite
+        with suppress(FactorisationError):  # in an exact draw: the steps before it left values that are not finite
             for last in mcem.sample(factorised, chain, data, num_samples, spacing, generator, settings):
                 positions.append(last.position)
         if len(positions) == num_samples and is_plausible(pool := torch.stack(positions)):
@@ -137,7 +137,7 @@ def sample_pool(
         settings = replace(settings, step_size=0.5 * settings.step_size)
     raise TrainingError(
         f"sampling the posterior diverged {MAX_ROLLBACKS + 1} times, the last time with the step size "
-        f"{2 * settings.step_size:g}"
+        f"{2 * settings.step_size:g}: train with a smaller step_size"
     )
 
 
@@ -158,7 +158,7 @@ def predictive_log_likelihood(
 
 
 def _advance(run: MCEM, num_iterations: int, generator: torch.Generator, best: float) -> str | None:
-    """Take the steps; what went wrong, or None. The host looks at the run once, at the end."""
+    """Take the steps; return what went wrong, or None. The host reads the run's values once, at the end."""
     try:
         for _ in range(num_iterations):
             run.step(generator)
@@ -173,7 +173,7 @@ def _advance(run: MCEM, num_iterations: int, generator: torch.Generator, best: f
     return None
 
 
-def _split(data: Data, generator: torch.Generator) -> tuple[Data, Data | None]:
+def _split_off_held_out(data: Data, generator: torch.Generator) -> tuple[Data, Data | None]:
     """Training data and held-out data; None where there are too few to hold any out."""
     share, most = HELD_OUT
     count = min(int(share * data.num_rows), most)
@@ -183,12 +183,12 @@ def _split(data: Data, generator: torch.Generator) -> tuple[Data, Data | None]:
     return data.rows(order[count:]), data.rows(order[:count])
 
 
-def _copied(generator: torch.Generator) -> torch.Generator:
+def _copy_of(generator: torch.Generator) -> torch.Generator:
     """A generator that gives the same numbers and leaves the given one where it is."""
     return torch.Generator(generator.device).set_state(generator.get_state())
 
 
-def _drawn_rows(window: Float[Tensor, "W V"], generator: torch.Generator) -> Float[Tensor, "n V"]:
+def _draw_positions(window: Float[Tensor, "W V"], generator: torch.Generator) -> Float[Tensor, "n V"]:
     """`HELD_OUT_SAMPLES` positions, drawn with replacement."""
     rows = torch.randint(len(window), (HELD_OUT_SAMPLES,), generator=generator, device=window.device)
     return window[rows]

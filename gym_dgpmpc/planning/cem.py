@@ -70,17 +70,19 @@ class CEM:
     Every plan starts with the standard deviation (high - low) / 4, whatever the plan before it ended with; only the
     mean is carried from one control step to the next. The result is the mean, not the best sequence sampled.
 
+    PETS stops at the variance 0.001 in the units of the action: the default of ``min_std`` on a range of 6, and before
+    the first iteration on a range of 0.1. A fraction of the range does not depend on the units.
+
     Args:
         action_low: lower bounds of the action, [A], finite; their dtype and device are those of the plans.
-        action_high: upper bounds, alike.
-        horizon: H, the number of actions in a plan.
-        num_candidates: K, the sequences sampled in each iteration.
-        num_elites: the best of them, to which the Gaussian is fitted; default: a tenth, and at least one.
-        num_iterations: the most iterations a plan takes.
+        action_high: upper bounds, with the same dtype and device.
+        horizon: actions in a plan, H; the time a plan takes grows with it.
+        num_candidates: action sequences sampled in each iteration, K.
+        num_elites: best sequences of an iteration, to which the Gaussian is fitted; default: a tenth of the candidates,
+            at least one.
+        num_iterations: iterations of a plan, at most.
         smoothing: weight of the old mean and variance in the new ones, in [0, 1).
-        min_std: stop once every action's standard deviation is below this fraction of its range. (PETS stops at the
-            variance 0.001 in the units of the action, which is this default on a range of 6 and never samples at all
-            on a range of 0.1; a fraction does not depend on the units.)
+        min_std: stop early once every action's standard deviation is below this fraction of its range.
 
     Raises:
         TypeError, ValueError: naming the argument, what was expected and what was received.

@@ -52,13 +52,13 @@ class Controller:
         planner: optimises action sequences; its horizon is the plan's.
         action_space: bounds of the actions.
         num_particles: P, worlds per plan.
-        actions_per_plan: actions performed of each plan before the next one is made.
+        actions_per_plan: actions of a plan to perform before the next plan is made.
         time_budget: seconds that a plan may take, or None; see `act`.
         device: where dynamics and planner compute.
 
     Raises:
-        TypeError, ValueError: a number is out of its range, the planner's plans are none, or their actions are not
-            those of ``action_space``.
+        TypeError, ValueError: a number is out of its range, the planner's plans are not NamedTuples of tensors, or
+            their actions do not fit ``action_space``.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Controller:
 
     @property
     def actions_per_plan(self) -> int:
-        """Actions performed of each plan before the next one is made."""
+        """Actions of a plan to perform before the next plan is made."""
         return self._actions_per_plan
 
     @actions_per_plan.setter
@@ -137,24 +137,24 @@ class Controller:
     ) -> Acted:
         """One action from the carried plan; if none of its actions are left, optimise it first.
 
-        With a time budget the planner is told until when it may go on, and returns the best plan so far. Drawing the
-        worlds is part of the budget; a plan that was late all the same is counted.
+        With a time budget the planner gets a deadline, and returns the best plan that it has found by then. Drawing
+        the worlds is part of the budget; a plan that is late all the same is counted.
 
         Args:
             task: what to plan for, and how the model sees an observation.
             observation: [S].
             carried: what the last step of the same episode returned, or `cold`.
             generator: for the worlds and the planner.
-            worlds: of `worlds`; None draws some for this plan alone.
+            worlds: what `worlds` returned; None draws some for this plan alone.
 
         Raises:
-            PlanningError: no candidate had a finite return, or the planner's result is no plan of its own or would
-                have an action that is not finite.
+            PlanningError: no candidate had a finite return, or the planner returned something other than a plan of its
+                own with finite actions.
         """
         started = time.perf_counter()
         plan, age = carried
         info, late = None, False
-        if age >= self.actions_per_plan:  # which are fewer now than when it was made
+        if age >= self.actions_per_plan:  # it has become smaller since the plan was made
             plan, age = self.planner.shift(plan, age), 0
         if age == 0:
             deadline = None if self.time_budget is None else started + self.time_budget
@@ -170,7 +170,7 @@ class Controller:
             except PlanningError as error:
                 raise PlanningError(f"{error}; planning started from the observation {observation}") from error
             self.num_late += late
-        # In the precision in which it is stored, so that performing it again is the same.
+        # In the precision in which it is stored, so that it can be performed again exactly.
         action = plan.actions[age].float().clamp(self._low, self._high).cpu().numpy()
         age += 1
         after = PlanState(plan, age) if age < self.actions_per_plan else PlanState(self.planner.shift(plan, age))
@@ -188,7 +188,7 @@ class Controller:
     def _check_planned(self, plan: Plan) -> None:
         """Raise PlanningError unless a plan can be performed, carried on and saved.
 
-        Once for every planner, so that whatever a planner does nothing that is not finite becomes an action.
+        Here rather than in the planners, so that no planner of any kind can have a value performed that is not finite.
         """
         name = type(self.planner).__name__
         expected = {field: (tuple(value.shape), value.dtype) for field, value in self.cold.plan._asdict().items()}

@@ -13,7 +13,7 @@ from torch import Tensor
 from gym_dgpmpc.types import Plan
 
 PackedPlans = tuple[np.ndarray, ...]
-"""The plans of n environments in SB3's `state` slot: the plan's fields in order, each [n, ...], and the ages [n]."""
+"""The plans of n environments in SB3's `state` slot: the fields of a plan in order, each [n, ...], and the ages [n]."""
 
 AGE = "plan.age"
 
@@ -44,7 +44,7 @@ def unpack(packed: PackedPlans, cold: PlanState, num_envs: int, actions_per_plan
 
 
 def plans_to_tensors(states: Sequence[PlanState]) -> dict[str, Tensor]:
-    """The plans of n environments, on the CPU: "plan.<field>" [n, ...] of each field, and "plan.age" [n]."""
+    """The plans of n environments, on the CPU: each field as "plan.<field>" [n, ...], and "plan.age" [n]."""
     plans = [state.plan._asdict() for state in states]
     fields = {f"plan.{name}": torch.stack([plan[name] for plan in plans]).cpu() for name in plans[0]}
     return fields | {AGE: torch.tensor([state.age for state in states], dtype=torch.int64)}
@@ -57,14 +57,14 @@ def plans_from_tensors(
 
     Raises:
         KeyError: a field is missing.
-        ValueError: a shape is another, an age is none that a plan is carried at, or an action is not finite.
+        ValueError: a shape is wrong, an age is out of range, or an action is not finite.
     """
     expected = _shapes(cold, num_envs)
     found = {name: tuple(tensors[name].shape) for name in expected}
     if found != expected:
         raise ValueError(
             f"state must be what predict returned for {num_envs} observation(s): arrays of shapes "
-            f"{_listed(expected)}, got {list(found.values())}"
+            f"{_described(expected)}, got {list(found.values())}"
         )
     fields = {
         name: tensors[f"plan.{name}"].to(device=value.device, dtype=value.dtype)
@@ -72,7 +72,7 @@ def plans_from_tensors(
     }
     ages = [int(age) for age in tensors[AGE]]
     if not all(0 <= age < actions_per_plan for age in ages):
-        raise ValueError(f"the age of a plan lies in 0 to {actions_per_plan - 1} actions, got {ages}")
+        raise ValueError(f"the age of a plan must lie in 0 to {actions_per_plan - 1} actions, got {ages}")
     plans = [plan_of(cold.plan, {name: value[i] for name, value in fields.items()}) for i in range(num_envs)]
     for plan in plans:
         if not plan.actions.isfinite().all():
@@ -90,5 +90,5 @@ def _shapes(cold: PlanState, num_envs: int) -> dict[str, tuple[int, ...]]:
     return fields | {AGE: (num_envs,)}
 
 
-def _listed(shapes: Mapping[str, tuple[int, ...]]) -> str:
+def _described(shapes: Mapping[str, tuple[int, ...]]) -> str:
     return ", ".join(f"{shape} ({name.removeprefix('plan.')})" for name, shape in shapes.items())

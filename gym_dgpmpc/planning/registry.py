@@ -28,31 +28,31 @@ def register_planner(name: str, factory: PlannerFactory) -> None:
         TypeError: the factory cannot be called.
     """
     if not re.fullmatch(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*", name):
-        raise ValueError(f"a planner's name is lower-case words such as 'my-planner', got {name!r}")
+        raise ValueError(f"a planner's name must be lower-case words such as 'my-planner', got {name!r}")
     if not callable(factory):
-        raise TypeError(f"a planner's factory is a class or a function, got {factory!r}")
+        raise TypeError(f"a planner's factory must be a class or a function, got {factory!r}")
     if PLANNERS.setdefault(name, factory) is not factory:
         raise ValueError(f"the name {name!r} is taken by {PLANNERS[name]!r}: choose another one")
 
 
 def is_ready_made(planner: str | PlannerFactory | Planner) -> TypeGuard[Planner]:
-    """Whether it is a planner already, and nothing that makes one."""
+    """Whether it is a planner itself, rather than its name or something that makes one."""
     return isinstance(planner, Planner) and not isinstance(planner, type)
 
 
 def planner_factory(planner: str | PlannerFactory | Planner) -> PlannerFactory:
-    """The class or function that makes a planner of this name; one that is given in place of a name is returned.
+    """The class or function that makes the planner of this name; one given in place of a name is returned as it is.
 
     Raises:
-        ValueError: there is no planner of this name.
-        TypeError: it is neither a name nor can it be called.
+        ValueError: no planner is registered under this name.
+        TypeError: it is neither a name nor callable.
     """
     if isinstance(planner, str):
         if planner not in PLANNERS:
-            raise ValueError(f"there is no planner {planner!r}; registered are {sorted(PLANNERS)}")
+            raise ValueError(f"unknown planner {planner!r}: expected one of {sorted(PLANNERS)} (see register_planner)")
         return PLANNERS[planner]
     if not callable(planner):
-        raise TypeError(f"a planner is given by name, class, function or as an object, got {planner!r}")
+        raise TypeError(f"planner must be a name, a class or function that makes one, or an object, got {planner!r}")
     return planner
 
 
@@ -71,12 +71,12 @@ def make_planner(
         settings: its keyword arguments; none for a ready-made one.
 
     Raises:
-        ValueError: there is no planner of this name, or a setting is out of its range.
-        TypeError: a setting that the planner does not have, or with a ready-made planner any.
+        ValueError: no planner is registered under this name, or a setting is out of its range.
+        TypeError: the planner does not have a setting, or it is ready-made and settings were given.
     """
     if is_ready_made(planner):
         if settings:
-            raise TypeError(f"a ready-made planner has its settings already, got {sorted(settings)} with it")
+            raise TypeError(f"a ready-made planner has its settings: expected no others, got {sorted(settings)}")
         return planner
     low, high = action_bounds(action_space, device)
     return planner_factory(planner)(low, high, **settings)

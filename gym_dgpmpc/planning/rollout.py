@@ -97,7 +97,7 @@ def rollout_objective(
 ) -> Objective:
     """The planner's objective: the mean over the particles of the return from ``observation``.
 
-    One particle that is not finite makes its candidate's score not finite; none is ever left out of the mean.
+    One particle that is not finite makes its candidate's score not finite; the mean leaves no particle out.
 
     Raises:
         ValueError: ``num_particles`` is not positive or ``observation`` not a floating-point vector.

@@ -1,4 +1,9 @@
-"""Reporting: figures and videos of what an agent learned, and runs that keep their results in a folder."""
+"""Training runs, each with a folder of its own: its settings, results, agent and pictures.
+
+`training.py` runs an agent; `folder.py` keeps its results, and lets a killed run go on. `recording.py`, `figures.py`
+and `rendering.py` make the pictures; `provenance.py` records versions and machine. The command line and the benchmarks
+are made of these, and nothing in the rooms above knows this one.
+"""
 
 from gym_dgpmpc.runs.figures import Forecast, observation_labels, plot_learning_curve, plot_prediction_fan
 

@@ -60,12 +60,12 @@ def plot_learning_curve(
         episode_steps: environment steps of each episode; the lower axis then says how many were taken in all.
 
     Raises:
-        ValueError: there are no episodes, or not one number of steps for each.
+        ValueError: there are no episodes, or ``episode_steps`` has another length than ``returns``.
     """
     if not len(returns):
         raise ValueError("a learning curve needs at least one episode, got none")
     if episode_steps is not None and len(episode_steps) != len(returns):
-        raise ValueError(f"got {len(returns)} returns, but the steps of {len(episode_steps)} episodes")
+        raise ValueError(f"episode_steps must have {len(returns)} numbers, one per return, got {len(episode_steps)}")
     episodes = np.arange(1, len(returns) + 1)
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     axes = figure.subplots()
@@ -106,13 +106,13 @@ def plot_prediction_fan(
         step_seconds: duration of an environment step, if it is known.
 
     Raises:
-        ValueError: there is no forecast, or the labels do not fit.
+        ValueError: there are no forecasts, or another number of labels than S.
     """
     if not forecasts:
         raise ValueError("a prediction fan needs at least one forecast, got none")
     size = forecasts[0].observed.shape[1]
     if len(labels) != size:
-        raise ValueError(f"got {len(labels)} labels for an observation of {size} numbers")
+        raise ValueError(f"labels must have {size} texts, one per number of the observation, got {len(labels)}")
     shown = [i for i in range(size) if any(_moves(forecast, i) for forecast in forecasts)][:MAX_DIMENSIONS]
     shown = shown or [0]
     figure = Figure(figsize=(5.2 * len(forecasts) + 0.8, 1.9 * len(shown) + 1.2), layout="constrained")

@@ -1,4 +1,4 @@
-"""With what and where results are made: versions, machine, and the revision of this package's source."""
+"""What results are made with: versions of packages, the machine, and the revision of this package's source."""
 
 import importlib.metadata
 import os
@@ -12,13 +12,13 @@ import torch
 
 PACKAGES = ("gym-dgpmpc", "gymnasium", "mujoco", "numpy", "stable-baselines3", "torch")
 OPTIONAL = ("dask", "distributed", "gpytorch", "gymnasium-robotics", "minari", "ray")
-"""What extras bring; recorded where it is installed."""
+"""Packages of the extras; recorded where they are installed."""
 
 UNKNOWN = "unknown"
 
 
 def versions() -> dict[str, str]:
-    """Of Python, of the packages that results depend on, and of the optional ones that are installed."""
+    """Versions of Python, of the packages that results depend on, and of the optional ones that are installed."""
     found = {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in PACKAGES}
     for name in OPTIONAL:
         with suppress(importlib.metadata.PackageNotFoundError):
@@ -27,7 +27,7 @@ def versions() -> dict[str, str]:
 
 
 def processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
-    """The processor's name, where the system tells it; else its architecture."""
+    """The processor's name, if the system gives it; else its architecture."""
     lines = cpuinfo.read_text(errors="replace").splitlines() if cpuinfo.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return next(filter(None, names), "") or platform.processor() or platform.machine()
@@ -54,7 +54,7 @@ def revision(package: Path = Path(__file__).parents[1]) -> str:
         command = ["git", "-C", str(package), *arguments]
         try:
             result = subprocess.run(command, capture_output=True, text=True, check=False)
-        except OSError:  # there is no git
+        except OSError:  # git is not installed
             return None
         return result.stdout.strip() if result.returncode == 0 else None
 

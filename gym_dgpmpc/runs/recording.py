@@ -36,7 +36,7 @@ class Episode(NamedTuple):
 class EpisodeRecorder(gymnasium.Wrapper):
     """Keeps the last episode that ended, its pictures too if the environment renders `rgb_array`.
 
-    Of a task whose `step` was made to return another reward (`RiskSensitiveReward`) it keeps the task's own.
+    Where `RiskSensitiveReward` makes `step` return another reward, it keeps the task's own.
 
     A long episode's pictures are thinned out, evenly, so that its GIF keeps the true speed at a readable size.
 
@@ -51,7 +51,7 @@ class EpisodeRecorder(gymnasium.Wrapper):
         super().__init__(env)
         self.last: Episode | None = None
         self._on_end = on_end
-        # In `env.metadata` of a vector environment's or a wrapper's making the rate may be missing.
+        # The metadata of a vector environment or of a wrapper may lack the rate.
         rate = float(env.metadata.get("render_fps") or MAX_FRAMES_PER_SECOND)
         limit = (env.spec.max_episode_steps if env.spec is not None else None) or MAX_FRAMES
         self._steps_per_frame = max(1, round(rate / MAX_FRAMES_PER_SECOND), -(-limit // MAX_FRAMES))
@@ -95,7 +95,7 @@ class EpisodeRecorder(gymnasium.Wrapper):
 
 
 class ForecastCallback(BaseCallback):
-    """Draws worlds early in each planned episode, and when it has ended compares them with what happened.
+    """Draws worlds early in each planned episode, and compares them with what happened when it has ended.
 
     The worlds are drawn when the step that they start from has just been made, so the model has not seen what it
     predicts. Their generator depends on the seed and the step alone: they leave the run as it is without them, and a
@@ -131,7 +131,7 @@ class ForecastCallback(BaseCallback):
         return True
 
     def _compare(self, episode: Episode, start: int) -> Forecast:
-        """What the worlds drawn at a step make of the actions that were taken from it, beside what they led to."""
+        """What the worlds drawn at a step predict for the actions taken from it, beside what happened."""
         modelled = self.agent.task.modelled
         actions = episode.actions[start : start + self.horizon].reshape(1, -1, episode.actions[0].size)
         predicted = rollout(

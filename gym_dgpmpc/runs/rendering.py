@@ -1,7 +1,7 @@
-"""Off-screen pictures of an environment: whether they can be had here, and writing them as a GIF.
+"""Off-screen pictures of an environment: whether this machine can draw them, and writing them as a GIF.
 
-Creating an OpenGL context where there is none may raise, or abort the interpreter. So it is tried in a process of its
-own first. `python -m gym_dgpmpc.runs.rendering` prints the value for MUJOCO_GL that works here, if one does.
+Without OpenGL, creating a context may raise or abort the interpreter, so it is tried first in a process of its own.
+`python -m gym_dgpmpc.runs.rendering` prints the value for MUJOCO_GL that works here, if one does.
 """
 
 import os
@@ -72,7 +72,7 @@ def write_gif(frames: Sequence[ndarray], path: str | Path, frames_per_second: fl
 
     if not frames:
         raise ValueError("a GIF needs at least one frame, got none")
-    # The format counts in hundredths of a second, and browsers slow down what is faster than two of them.
+    # The format counts in hundredths of a second, and browsers slow down pictures shorter than two of them.
     duration = max(round(100 / frames_per_second), 2) * 10
     # One palette for the whole episode: a palette for each frame flickers and costs space.
     middle = Image.fromarray(frames[len(frames) // 2]).quantize(128)

@@ -56,11 +56,11 @@ class PenalisedReward:
 
 
 class RiskSensitiveReward(gym.Wrapper, RecordConstructorArgs):
-    """Plan with a reward that is less the larger an angle is: r - floor(|angle| / angle_step).
+    """Plan with a reward that falls as an angle grows: r - floor(|angle| / angle_step).
 
     A planner finds the penalised reward as `reward_fn`, and evaluates it on the states that it predicts. What `step`
-    returns is still the reward of the task, by which agents are compared, unless ``penalise_step``: agents that
-    learn from the returned reward, having no model, can be told of the risk in no other way. ``info`` holds both,
+    returns is still the reward of the task, by which agents are compared, unless ``penalise_step``: agents
+    without a model, which learn from the returned reward, cannot learn of the risk otherwise. ``info`` holds both,
     as ``reward_original`` and ``reward_risk_sensitive``.
 
     Args:
@@ -85,7 +85,7 @@ class RiskSensitiveReward(gym.Wrapper, RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         space = env.observation_space
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-            raise ValueError(f"observations must be vectors to have an angle at an index; the space is {space}")
+            raise ValueError(f"observations must be vectors for angle_index to name one number; the space is {space}")
         try:
             angle_index = index(angle_index)
         except TypeError as error:
@@ -116,7 +116,7 @@ def _reward_of(env: gym.Env) -> RewardFn:
     task = known.find(env)
     if task is None or task.reward_fn is None:
         raise ValueError(
-            f"a reward that is planned with must be a function of predicted states, but {env} has no attribute "
-            "'reward_fn' and its reward is not among the known ones"
+            f"cannot evaluate the reward of {env} on predicted states: it has no attribute 'reward_fn', and its reward "
+            "is not among those of gym_dgpmpc.envs.known; give the environment a reward_fn"
         )
     return task.reward_fn

@@ -71,7 +71,7 @@ def test_a_plan_without_any_time_is_the_shifted_one(capsys):
     assert learner.store.transitions().action[LENGTH:].abs().max() == 0  # the middle, where a cold plan starts
     mean = np.linspace(-3.0, 3.0, 5, dtype=np.float32).reshape(1, 5, 1)
     state = (mean, np.ones_like(mean), np.array([0]))
-    with pytest.warns(UserWarning, match="longer than the time_budget of 1e-09 s: see num_late_plans"):
+    with pytest.warns(UserWarning, match="time_budget of 1e-09 s.*num_late_plans"):
         action, after = learner.predict(OBSERVATION, state)
     assert action == -2.0  # within the bounds, whatever the plan was
     np.testing.assert_allclose(after[0][0, :, 0], [-1.5, 0.0, 1.5, 2.0, 0.0])
@@ -91,21 +91,21 @@ def test_metrics_count_late_plans_and_leave_out_what_was_not_expected():
     assert {name: again[name] for name in again if "seconds" not in name} == {
         name: metrics[name] for name in metrics if "seconds" not in name
     }
-    with pytest.raises(ValueError, match="plans of different counts"):
+    with pytest.raises(ValueError, match=r"\[2, 5\]"):
         restored.load_state_dict({**record.state_dict(), "plan_steps": torch.zeros(5)})
 
 
 def test_a_budget_that_is_set_later_takes_effect_at_once():
     learner = agent().learn(2 * LENGTH)
     learner.controller.time_budget = 1e-9
-    with pytest.warns(UserWarning, match="time_budget"):
+    with pytest.warns(UserWarning, match="time_budget of 1e-09 s"):
         learner.predict(OBSERVATION)
     assert learner.num_late_plans == 1
 
 
 @pytest.mark.parametrize("budget", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_budget_is_a_positive_time(budget):
-    with pytest.raises(ValueError, match="time_budget must be a positive number of seconds"):
+    with pytest.raises(ValueError, match=rf"time_budget .* {budget}$"):
         agent(time_budget=budget)
 
 

@@ -207,7 +207,7 @@ def test_a_reset_that_is_not_finite():
     learner.learn(15)
     reset = env.reset
     env.reset = lambda **kwargs: (np.array([np.nan, 0.0]), {})
-    with pytest.raises(EnvironmentDataError, match=r"after 20 steps.*reset.*nan"):
+    with pytest.raises(EnvironmentDataError, match=r"\b20 steps.*reset.*nan"):
         learner.learn(15, reset_num_timesteps=False)
     assert len(learner.store) == 20
     env.reset = reset
@@ -217,7 +217,7 @@ def test_a_reset_that_is_not_finite():
 
 def test_an_environment_that_raises():
     learner = agent(KnownPointMass(fail_at=13, failure=ConnectionError("the plant is gone")))
-    with pytest.raises(EnvironmentFailedError, match=r"^step 13: .*step raised ConnectionError: the plant") as raised:
+    with pytest.raises(EnvironmentFailedError, match=r"^step 13: .*ConnectionError: the plant") as raised:
         learner.learn(30)
     assert isinstance(raised.value.__cause__, ConnectionError)
     assert len(learner.store) == 13
@@ -230,7 +230,7 @@ def test_an_environment_whose_reset_raises_keeps_the_step_that_ended_the_episode
     learner = agent(env)
     reset = env.reset
     env.reset = lambda **kwargs: reset(**kwargs) if env.num_steps != 2 * LENGTH else 1 / 0
-    with pytest.raises(EnvironmentFailedError, match=r"step 19: the environment's reset raised ZeroDivisionError"):
+    with pytest.raises(EnvironmentFailedError, match=r"step 19: .*reset .*ZeroDivisionError"):
         learner.learn(30)
     assert len(learner.store) == learner.num_timesteps == 2 * LENGTH
     env.reset = reset
@@ -274,7 +274,7 @@ def test_planning_that_fails_names_the_observation():
 
 
 def test_a_planner_of_a_shorter_horizon_than_its_use_is_refused():
-    with pytest.raises(ValueError, match="actions_per_plan must lie in 1 to the planner's horizon 5, got 6"):
+    with pytest.raises(ValueError, match=r"actions_per_plan .*horizon 5\b.* 6$"):
         agent(actions_per_plan=6)
     assert planner().horizon == 5
 

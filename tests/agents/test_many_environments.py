@@ -109,13 +109,13 @@ def test_the_seed_decides_everything_and_envs_differ():
 def test_a_failing_environment_costs_that_step_of_all():
     env = DummyVecEnv([KnownPointMass, lambda: KnownPointMass(fail_at=4), KnownPointMass])
     learner = agent(env)
-    with pytest.raises(EnvironmentDataError, match=r"step 13: next_observation\[0\] must be finite"):
+    with pytest.raises(EnvironmentDataError, match=r"step 13: next_observation\[0\] .*nan"):
         learner.learn(60)
     assert len(learner.store) == learner.num_timesteps == 12
     learner.learn(48, reset_num_timesteps=False)
     assert len(learner.store) == 60
     raising = DummyVecEnv([KnownPointMass, lambda: KnownPointMass(fail_at=2, failure=OSError("gone"))])
-    with pytest.raises(EnvironmentFailedError, match="step 4: the environment raised OSError: gone"):
+    with pytest.raises(EnvironmentFailedError, match=r"step 4: .*OSError: gone"):
         agent(raising).learn(20)
 
 
@@ -126,7 +126,7 @@ def test_a_run_goes_on_with_its_data_and_new_episodes(tmp_path):
     assert resumed.num_timesteps == len(resumed.store) == 99
     assert resumed.dynamics.fits == [3 * 14, 3 * 24]
     assert len(torch.unique(resumed.store.episodes)) == 3 * (2 + 2)
-    with pytest.raises(CheckpointError, match="it had 3 environments, now 2"):
+    with pytest.raises(CheckpointError, match=r"\b3 environments.*\b2\b"):
         agent(several(2)).learn(1, run_folder=tmp_path, resume=True)
 
 
@@ -207,14 +207,14 @@ def test_a_task_that_never_ends_is_explored_until_the_first_training_is_due():
 
 def test_an_agent_that_waits_for_an_end_says_so(monkeypatch):
     monkeypatch.setattr("gym_dgpmpc.agents.mpc.ENDLESS", 30)
-    with pytest.warns(UserWarning, match="after 30 random steps no episode has ended.*TimeLimit.*learning_starts"):
+    with pytest.warns(UserWarning, match=r"\b30 random steps.*TimeLimit.*learning_starts"):
         assert agent(Endless()).learn(40).is_exploring
 
 
 def test_training_every_so_many_steps_goes_before_episodes():
     learner = agent(train_freq=15).learn(50)
     assert learner.dynamics.fits == [10, 25, 40]
-    with pytest.raises(ValueError, match="train_freq must be at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"train_freq .* 0$"):
         agent(train_freq=0)
 
 

@@ -1,5 +1,7 @@
 """Prediction: the plan as a recurrent state, determinism, shapes, and no trace left in learning."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -82,14 +84,14 @@ def test_prediction_leaves_learning_alone(deterministic, actions_per_plan):
             _, state = disturbed.predict(OBSERVATION, state, deterministic=deterministic)
         return True
 
-    with pytest.warns(UserWarning, match="before the agent has learned"):
+    with pytest.warns(UserWarning, match=r"predict.*learned"):
         disturbed.learn(35, callback=predict_often)
     np.testing.assert_array_equal(actions_of(undisturbed.env.envs[0]), actions_of(disturbed.env.envs[0]))
 
 
 def test_an_agent_that_has_not_learned_warns_once_and_acts():
     fresh = agent()
-    with pytest.warns(UserWarning, match="before the agent has learned") as warned:
+    with pytest.warns(UserWarning, match=r"predict.*learned") as warned:
         middle, state = fresh.predict(OBSERVATION, deterministic=True)
         actions = np.array([fresh.predict(OBSERVATION, state)[0] for _ in range(50)])
     assert len(warned) == 1
@@ -100,23 +102,23 @@ def test_an_agent_that_has_not_learned_warns_once_and_acts():
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3), (1, 1, 2)])
 def test_an_observation_of_the_wrong_shape_is_named(learned, shape):
-    with pytest.raises(ValueError, match=r"expected an observation of shape \(2,\) or \(n, 2\), got"):
+    with pytest.raises(ValueError, match=rf"observation .*\(2,\).*{re.escape(str(shape))}"):
         learned.predict(np.zeros(shape))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_an_observation_that_is_not_finite_is_named(learned, value):
-    with pytest.raises(EnvironmentDataError, match=r"not finite: \[0\.1"):
+    with pytest.raises(EnvironmentDataError, match=rf"finite: \[ *0\.1 +{value}\]"):
         learned.predict(np.array([0.1, value]))
 
 
 def test_a_state_of_another_agent_is_refused(learned):
     _, (mean, std, age) = learned.predict(OBSERVATION)
-    with pytest.raises(ValueError, match=r"\(1, 5, 1\).*got \[\(1, 4, 1\)"):
+    with pytest.raises(ValueError, match=r"\(1, 5, 1\).*\(1, 4, 1\)"):
         learned.predict(OBSERVATION, (mean[:, 1:], std[:, 1:], age))
     with pytest.raises(ValueError, match=r"2 observation\(s\)"):
         learned.predict(np.stack([OBSERVATION] * 2), (mean, std, age))
-    with pytest.raises(ValueError, match="age of a plan lies in 0 to 0"):
+    with pytest.raises(ValueError, match=r"age .*\[7\]"):
         learned.predict(OBSERVATION, (mean, std, age + 7))
 
 

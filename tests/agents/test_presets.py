@@ -6,7 +6,7 @@ import inspect
 import gymnasium
 import pytest
 
-from gym_dgpmpc import DGPMPCAgent
+from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, PETSAgent
 from gym_dgpmpc.agents import presets
 
 
@@ -34,46 +34,46 @@ def test_settings_are_found_by_id():
     assert not set(presets.PAPER) & set(presets.STOCK)
 
 
-@pytest.mark.parametrize(
-    ("env_ids", "planning"),
-    [
-        (["ModCartPole-v0", "SwingUpCartPole-v0"], (30, 5, 1)),
-        (["BiasedReacher-v0", "Reacher7DoF-v0"], (20, 5, 1)),
-        (["RiskSensitiveHalfCheetah-v0", "VelocityHalfCheetah-v0"], (40, 10, 2)),
-    ],
-)
-def test_planning_is_as_in_the_papers_table(env_ids, planning):
-    names = ("horizon", "num_iterations", "actions_per_plan")
-    for env_id in env_ids:
-        shared = {"num_candidates": 300, "num_elites": 30, "num_particles": 5}
-        wanted = dict(zip(names, planning, strict=True)) | shared
-        assert presets.PAPER[env_id] == wanted | {"num_inducing": 200}
-        assert presets.COMPARISON_GP[env_id] == presets.PAPER[env_id]
-        assert {name: presets.COMPARISON_PETS[env_id][name] for name in wanted} == wanted
+TABLES = {
+    "paper": (DGPMPCAgent, presets.PAPER),
+    "published PETS": (PETSAgent, presets.PETS),
+    "PETS in the comparison": (PETSAgent, presets.COMPARISON_PETS),
+    "GP in the comparison": (GPMPCAgent, presets.COMPARISON_GP),
+}
+PLANNING = ("horizon", "num_candidates", "num_elites", "num_iterations", "actions_per_plan", "num_particles")
+
+
+@pytest.mark.parametrize(("table", "env_id"), [(table, env_id) for table in TABLES for env_id in presets.PAPER])
+def test_settings_make_an_agent_that_plans_with_them(table, env_id):
+    agent_class, settings = TABLES[table][0], TABLES[table][1][env_id]
+    agent = agent_class(gymnasium.make(env_id), **settings, seed=0)
+    planner, controller = agent.planner, agent.controller
+    found = {name: getattr(planner if hasattr(planner, name) else controller, name) for name in PLANNING}
+    assert found == {name: settings[name] for name in PLANNING}
+    # Both papers fit the Gaussian to a tenth of the sequences, and look ahead for a part of an episode.
+    assert 10 * planner.num_elites == planner.num_candidates
+    assert planner.horizon < gymnasium.spec(env_id).max_episode_steps
 
 
 @pytest.mark.parametrize(
-    ("env_ids", "networks", "planning"),
+    ("one", "other"),
     [
-        (["ModCartPole-v0", "SwingUpCartPole-v0"], (3, 500, (1e-4, 2.5e-4, 2.5e-4, 5e-4), 1e-3), (400, 40, 25)),
-        (
-            ["BiasedReacher-v0", "Reacher7DoF-v0"],
-            (4, 200, (2.5e-4, 5e-4, 5e-4, 5e-4, 7.5e-4), 7.5e-4),
-            (400, 40, 25),
-        ),
-        (
-            ["RiskSensitiveHalfCheetah-v0", "VelocityHalfCheetah-v0"],
-            (4, 200, (2.5e-5, 5e-5, 7.5e-5, 7.5e-5, 1e-4), 1e-3),
-            (500, 50, 30),
-        ),
+        ("ModCartPole-v0", "SwingUpCartPole-v0"),
+        ("BiasedReacher-v0", "Reacher7DoF-v0"),
+        ("RiskSensitiveHalfCheetah-v0", "VelocityHalfCheetah-v0"),
     ],
 )
-def test_pets_is_as_published(env_ids, networks, planning):
-    """Chua et al. (2018), from their configuration files."""
-    of_networks = ("num_hidden_layers", "hidden_size", "weight_decay", "learning_rate")
-    of_planning = ("num_candidates", "num_elites", "horizon")
-    for env_id in env_ids:
-        wanted = dict(zip(of_networks, networks, strict=True))
-        assert {name: presets.COMPARISON_PETS[env_id][name] for name in of_networks} == wanted
-        wanted |= dict(zip(of_planning, planning, strict=True))
-        assert presets.PETS[env_id] == wanted | {"num_iterations": 5, "actions_per_plan": 1, "num_particles": 20}
+def test_variants_of_a_task_share_their_settings(one, other):
+    for _, table in TABLES.values():
+        assert table[one] == table[other]
+
+
+@pytest.mark.parametrize("env_id", presets.PAPER)
+def test_the_comparison_gives_all_methods_the_same_plans(env_id):
+    """The models are compared, so only they differ; of PETS's, each network moves one particle."""
+    paper, pets = presets.PAPER[env_id], presets.COMPARISON_PETS[env_id]
+    assert {name: pets[name] for name in PLANNING} == {name: paper[name] for name in PLANNING}
+    assert pets["num_particles"] == PETSAgent(gymnasium.make(env_id), **pets, seed=0).dynamics.num_members
+    assert presets.COMPARISON_GP[env_id] == paper
+    networks = pets.keys() - set(PLANNING)
+    assert networks and all(pets[name] == presets.PETS[env_id][name] for name in networks)

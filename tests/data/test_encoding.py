@@ -1,6 +1,7 @@
 """What the model reads and predicts, and the way back to the next observation."""
 
 import math
+import re
 
 import hypothesis.strategies as st
 import pytest
@@ -159,17 +160,14 @@ def test_a_body_that_heads_north_moves_forwards_northwards():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"body_frame": ((0, 1, 4),)}, r"triples .* from 0 to 3, received \(0, 1, 4\)"),
-        ({"body_frame": ((0, 1, 1),)}, r"distinct indices"),
-        ({"body_frame": ((0, 1, 2), (0, 2, 3))}, "share no index with another"),
-        ({"body_frame": ((0, 1, 2), (1, 0, 3))}, "share no index with another or with a heading"),
-        (
-            {"body_frame": ((0, 1, 2),), "absolute": (1,)},
-            r"1 and 2 must be both or neither .*absolute, received \(1,\)",
-        ),
-        ({"body_frame": ((0, 1, 2),), "constant": (2, 3)}, "both or neither .*constant"),
-        ({"body_frame": ((0, 1, 2),), "not_inputs": (2,)}, "both or neither .*not_inputs"),
-        ({"body_frame": ((0, 1, 2),), "angles": (2,)}, "1 and 2 are a vector, not angles"),
+        ({"body_frame": ((0, 1, 4),)}, r"body_frame .*\b3\b.*\(0, 1, 4\)"),
+        ({"body_frame": ((0, 1, 1),)}, r"body_frame .*\(0, 1, 1\)"),
+        ({"body_frame": ((0, 1, 2), (0, 2, 3))}, r"body_frame .*\(\(0, 1, 2\), \(0, 2, 3\)\)"),
+        ({"body_frame": ((0, 1, 2), (1, 0, 3))}, r"body_frame .*\(\(0, 1, 2\), \(1, 0, 3\)\)"),
+        ({"body_frame": ((0, 1, 2),), "absolute": (1,)}, r"absolute .*\b1 and 2\b.*\(1,\)"),
+        ({"body_frame": ((0, 1, 2),), "constant": (2, 3)}, r"constant .*\b1 and 2\b.*\(2, 3\)"),
+        ({"body_frame": ((0, 1, 2),), "not_inputs": (2,)}, r"not_inputs .*\b1 and 2\b.*\(2,\)"),
+        ({"body_frame": ((0, 1, 2),), "angles": (2,)}, r"angles .*\b1 or 2\b.*\(2,\)"),
     ],
 )
 def test_bad_vectors_are_named(fields, message):
@@ -180,17 +178,17 @@ def test_bad_vectors_are_named(fields, message):
 @pytest.mark.parametrize("field", ["angles", "absolute", "not_inputs", "constant"])
 @pytest.mark.parametrize("indices", [(4,), (-1,), (0, 0)])
 def test_bad_indices_are_named(field, indices):
-    with pytest.raises(ValueError, match=rf"{field}.*from 0 to 3.*received \({str(indices)[1:-1]}\)"):
+    with pytest.raises(ValueError, match=rf"{field} .*\b3\b.*{re.escape(str(indices))}$"):
         Encoder(4, 1, ObservationSpec(**{field: indices}))
 
 
 def test_nothing_to_predict_is_an_error():
-    with pytest.raises(ValueError, match="nothing is left to predict: all 2 dimensions are constant"):
+    with pytest.raises(ValueError, match=r"predict.*constant=\(0, 1\)"):
         Encoder(2, 1, ObservationSpec(constant=(0, 1)))
 
 
 def test_nothing_to_feed_is_an_error():
-    with pytest.raises(ValueError, match="nothing is left to feed"):
+    with pytest.raises(ValueError, match=r"feed.*not_inputs=\(0, 1\)"):
         Encoder(2, 0, ObservationSpec(not_inputs=(0, 1)))
 
 

@@ -1,6 +1,7 @@
 """The store keeps exactly what it was given, however it grows, and refuses what cannot be learned from."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -77,10 +78,10 @@ def test_growth_is_amortised():
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("terminated", math.nan, "step 2: terminated must be true or false, got nan"),
-        ("terminated", 2, "step 2: terminated must be true or false, got 2"),
-        ("episode", 1.7, "step 2: episode must be a whole number, got 1.7"),
-        ("episode", math.nan, "step 2: episode must be a whole number, got nan"),
+        ("terminated", math.nan, "step 2: terminated .* nan$"),
+        ("terminated", 2, "step 2: terminated .* 2$"),
+        ("episode", 1.7, r"step 2: episode .* 1\.7$"),
+        ("episode", math.nan, "step 2: episode .* nan$"),
     ],
 )
 def test_what_a_conversion_would_change_is_refused(name, value, message):
@@ -134,7 +135,7 @@ def test_what_is_not_finite_in_float32_is_refused_and_nothing_is_lost(name, inde
     store.extend(**part(slice(0, 10), data))
     bad = {each: np.array(array[10:15]) for each, array in data.items()}
     bad[name][index] = value
-    message = rf"step 12: {where} must be finite as float32, got {str(value).replace('+', '[+]')}$"
+    message = rf"step 12: {where} .* {re.escape(str(value))}$"
     with pytest.raises(EnvironmentDataError, match=message):
         store.extend(**bad)
     with pytest.raises(EnvironmentDataError, match=message.replace("step 12", "step 10")):
@@ -147,11 +148,11 @@ def test_what_is_not_finite_in_float32_is_refused_and_nothing_is_lost(name, inde
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("observation", np.zeros(S + 1), r"observation must have shape \(1, 3\), steps first, got \(1, 4\)"),
-        ("action", np.array(0.5), r"action must have shape \(1, 2\), steps first, got \(1,\)"),
-        ("next_observation", np.zeros((1, S)), r"next_observation must have shape \(1, 3\).*got \(1, 1, 3\)"),
-        ("observation", np.array(["a", "b", "c"]), "observation must be numeric, got dtype <U1"),
-        ("observation", np.array([1.0, 2.0, None]), "observation must be numeric, got dtype object"),
+        ("observation", np.zeros(S + 1), r"observation .*\(1, 3\).*\(1, 4\)"),
+        ("action", np.array(0.5), r"action .*\(1, 2\).*\(1,\)"),
+        ("next_observation", np.zeros((1, S)), r"next_observation .*\(1, 3\).*\(1, 1, 3\)"),
+        ("observation", np.array(["a", "b", "c"]), "observation .*<U1"),
+        ("observation", np.array([1.0, 2.0, None]), "observation .*object"),
     ],
 )
 def test_the_wrong_shape_or_kind_is_named(name, value, message):
@@ -163,13 +164,13 @@ def test_the_wrong_shape_or_kind_is_named(name, value, message):
 
 def test_fields_of_different_lengths_are_refused():
     data = rows(5)
-    with pytest.raises(EnvironmentDataError, match=r"action must have shape \(5, 2\), steps first, got \(4, 2\)"):
+    with pytest.raises(EnvironmentDataError, match=r"action .*\(5, 2\).*\(4, 2\)"):
         TransitionStore(S, A).extend(**{**data, "action": data["action"][:4]})
 
 
 @pytest.mark.parametrize("sizes", [(0, 1, 1), (1, 0, 1), (1, 1, 0)])
 def test_sizes_must_be_positive(sizes):
-    with pytest.raises(ValueError, match=r"must be at least 1, got .*0"):
+    with pytest.raises(ValueError, match=f"capacity .*{sizes[0]}, {sizes[1]} and {sizes[2]}"):
         TransitionStore(*sizes)
 
 
@@ -198,14 +199,14 @@ class TestStateDict:
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            (lambda state: state.pop("action"), r"have fields \['action', .*got \['episode'"),
-            (lambda state: state.update(extra=1), "got .*'extra'"),
-            (lambda state: state.update(reward=1.0), "stored reward must be a torch.float32 tensor, got float"),
-            (lambda state: state.update(episode=torch.zeros(5)), "stored episode .*int64 tensor, got torch.float32"),
-            (lambda state: state.update(action=torch.zeros(5, A + 1)), r"action must have shape \(5, 2\).*\(5, 3\)"),
-            (lambda state: state.update(reward=torch.zeros(4)), r"must have shape \(4, 3\).*got \(5, 3\)"),
-            (lambda state: state.update(reward=torch.zeros(())), "do not fit this store"),
-            (lambda state: state["observation"].fill_(math.nan), "step 0.*must be finite"),
+            (lambda state: state.pop("action"), r"fields \['action', .*\['episode'"),
+            (lambda state: state.update(extra=1), "fields .*'extra'"),
+            (lambda state: state.update(reward=1.0), r"reward .*torch\.float32.*\bfloat$"),
+            (lambda state: state.update(episode=torch.zeros(5)), r"episode .*int64.*torch\.float32"),
+            (lambda state: state.update(action=torch.zeros(5, A + 1)), r"action .*\(5, 2\).*\(5, 3\)"),
+            (lambda state: state.update(reward=torch.zeros(4)), r"observation .*\(4, 3\).*\(5, 3\)"),
+            (lambda state: state.update(reward=torch.zeros(())), r"observation .*\(0, 3\).*\(5, 3\)"),
+            (lambda state: state["observation"].fill_(math.nan), "step 0: observation.*nan"),
         ],
     )
     def test_a_state_that_does_not_fit_is_refused_and_nothing_is_lost(self, change, message):

@@ -188,9 +188,9 @@ def test_an_empty_state_is_an_untrained_model(learner):
     model = fitted(learner)
     model.load_state_dict({})
     assert model.state_dict() == {}
-    with pytest.raises(RuntimeError, match="cannot draw: the dynamics model has not been fitted"):
+    with pytest.raises(RuntimeError, match=r"draw.*fit"):
         model.draw(PARTICLES, HORIZON, seeded())
-    with pytest.raises(RuntimeError, match="cannot resample: the dynamics model has not been fitted"):
+    with pytest.raises(RuntimeError, match=r"resample.*fit"):
         model.resample(slider.transitions(5, NOISE), seeded())
 
 
@@ -200,7 +200,7 @@ def test_a_state_with_a_hole_is_refused_and_changes_nothing(learner):
     for missing in model.state_dict():
         state = dict(model.state_dict())
         del state[missing]
-        with pytest.raises(ValueError, match=f"'{missing}'.*received None"):
+        with pytest.raises(ValueError, match=f"'{missing}'.*None"):
             model.load_state_dict(state)
     assert torch.equal(states_of(model), before)
 

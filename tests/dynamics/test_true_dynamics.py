@@ -48,5 +48,5 @@ def test_there_is_nothing_to_learn_or_to_load():
     model = TrueDynamics(gymnasium.make("ModCartPole-v0"))
     assert model.state_dict() == {}
     model.load_state_dict({})
-    with pytest.raises(ValueError, match=r"have no state, received \['pool'\]"):
+    with pytest.raises(ValueError, match=r"state.*\['pool'\]"):
         model.load_state_dict({"pool": torch.zeros(1)})

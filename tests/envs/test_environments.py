@@ -114,7 +114,7 @@ def test_bad_actions_are_refused(env):
     task.reset(seed=0)
     shape = env.action_space.shape
     for action in (np.full(shape, np.nan, np.float32), np.zeros(8, np.float32), np.zeros((1, *shape))):
-        with pytest.raises(ValueError, match=re.escape(f"of shape {shape} of finite numbers; got {action!r}")):
+        with pytest.raises(ValueError, match=rf"action .*{re.escape(str(shape))}.*{re.escape(repr(action))}"):
             task.step(action)
 
 
@@ -164,17 +164,17 @@ def test_specs_and_pickles_make_the_same_environment(env):
 def test_arguments_are_checked(cls):
     defaults = {p.name: p.default for p in inspect.signature(CLASSES[CLASSES.index(cls)]).parameters.values()}
     common = [
-        ({"ctrl_cost_weight": -1.0}, "ctrl_cost_weight must not be negative; got -1.0"),
-        ({"ctrl_cost_weight": float("nan")}, "ctrl_cost_weight must be a finite number; got nan"),
-        ({"frame_skip": 0}, "frame_skip must be a positive integer; got 0"),
-        ({"width": -1}, "width must be a positive integer; got -1"),
-        ({"render_mode": "ascii"}, "got 'ascii'"),
+        ("ctrl_cost_weight", -1.0),
+        ("ctrl_cost_weight", float("nan")),
+        ("frame_skip", 0),
+        ("width", -1),
+        ("render_mode", "ascii"),
     ]
     if "reset_noise_scale" in defaults:
-        common.append(({"reset_noise_scale": -0.1}, "reset_noise_scale must not be negative; got -0.1"))
-    for arguments, message in common:
-        with pytest.raises(ValueError, match=re.escape(message)):
-            cls(**arguments)
+        common.append(("reset_noise_scale", -0.1))
+    for name, value in common:
+        with pytest.raises(ValueError, match=rf"{name} .*{re.escape(repr(value))}$"):
+            cls(**{name: value})
 
 
 # --- documentation ---------------------------------------------------------------------------------------------------

@@ -82,18 +82,18 @@ def test_returns_of_random_and_idle_episodes():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("name", "value", "received"),
     [
-        ({"start_position": 2.6}, "start_position must lie on the rail, in [-2.5, 2.5]; got 2.6"),
-        ({"start_position": float("nan")}, "start_position must be a finite number; got nan"),
-        ({"target": (1.0, 2.0, 3.0)}, "target must be two finite numbers, x and z in m; got (1.0, 2.0, 3.0)"),
-        ({"target": (1.0, float("inf"))}, "target must be a finite number; got inf"),
-        ({"reward_scale": 0.0}, "reward_scale must be positive; got 0.0"),
+        ("start_position", 2.6, "2.6"),
+        ("start_position", float("nan"), "nan"),
+        ("target", (1.0, 2.0, 3.0), "(1.0, 2.0, 3.0)"),
+        ("target", (1.0, float("inf")), "inf"),
+        ("reward_scale", 0.0, "0.0"),
     ],
 )
-def test_bad_arguments_are_named(arguments, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        ModCartPoleEnv(**arguments)
+def test_bad_arguments_are_named(name, value, received):
+    with pytest.raises(ValueError, match=rf"{name} .*{re.escape(received)}$"):
+        ModCartPoleEnv(**{name: value})
 
 
 def test_arguments_reach_the_task_and_survive_pickling():

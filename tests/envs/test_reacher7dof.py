@@ -278,8 +278,7 @@ def test_an_episode_can_be_asked_for():
 def test_an_episode_that_cannot_be(unchecked):
     env = BiasedReacherEnv()
     for wrong in (-1, 1.5, "2"):
-        message = f'options["episode"] must be an integer from 0 on; got {wrong!r}'
-        with pytest.raises(ValueError, match=re.escape(message)):
+        with pytest.raises(ValueError, match=rf'options\["episode"\] .*{re.escape(repr(wrong))}$'):
             env.reset(options={"episode": wrong})
 
 
@@ -319,14 +318,14 @@ def test_arguments_are_used():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("name", "value", "received"),
     [
-        ({"target_mean": (1.0, 2.0)}, "target_mean must be three finite numbers, x, y and z in m; got (1.0, 2.0)"),
-        ({"target_std": (1.0, 2.0, -1.0)}, "target_std must not be negative; got -1.0"),
-        ({"target_std": (1.0, 2.0, float("inf"))}, "target_std must be a finite number; got inf"),
-        ({"target_seed": -1}, "target_seed must be an integer from 0 on; got -1"),
+        ("target_mean", (1.0, 2.0), "(1.0, 2.0)"),
+        ("target_std", (1.0, 2.0, -1.0), "-1.0"),
+        ("target_std", (1.0, 2.0, float("inf")), "inf"),
+        ("target_seed", -1, "-1"),
     ],
 )
-def test_bad_arguments_are_named(arguments, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        BiasedReacherEnv(**arguments)
+def test_bad_arguments_are_named(name, value, received):
+    with pytest.raises(ValueError, match=rf"{name} .*{re.escape(received)}$"):
+        BiasedReacherEnv(**{name: value})

@@ -1,5 +1,6 @@
 """A simulator's trajectories against stepping the environment itself."""
 
+import re
 from types import SimpleNamespace
 
 import gymnasium
@@ -85,27 +86,27 @@ def offered(**changes):
 @pytest.mark.parametrize(
     ("layout", "message"),
     [
-        (SimulatorLayout((0,), (1, 2)), "2 positions and 2 velocities, received 1 and 2"),
-        (SimulatorLayout((0, 1), (1, 2)), "distinct indices into the 4 numbers"),
-        (SimulatorLayout((0, 1), (2, 4)), "distinct indices"),
-        (SimulatorLayout((0, None), (2, 3), rates=((1, 2),)), "rates of the 2 positions"),
+        (SimulatorLayout((0,), (1, 2)), r"\b2 positions.*\b1 and 2$"),
+        (SimulatorLayout((0, 1), (1, 2)), r"\b4 numbers.*velocities=\(1, 2\)"),
+        (SimulatorLayout((0, 1), (2, 4)), r"\b4 numbers.*velocities=\(2, 4\)"),
+        (SimulatorLayout((0, None), (2, 3), rates=((1, 2),)), r"\b2 positions.*rates=\(\(1, 2\),\)"),
     ],
 )
 def test_a_layout_that_does_not_fit_is_named(layout, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=rf"simulator_layout .*{message}"):
         Simulator(offered(simulator_layout=layout))
 
 
 def test_what_is_no_simulator_is_refused():
-    with pytest.raises(ValueError, match=r"needs a MuJoCo environment.*Pendulum"):
+    with pytest.raises(ValueError, match=r"MuJoCo.*PendulumEnv"):
         Simulator(gymnasium.make("Pendulum-v1"))
-    with pytest.raises(ValueError, match="5 numbers, but its simulator 2 positions and 2 velocities"):
+    with pytest.raises(ValueError, match=r"\b5 numbers.*\b2 positions and 2 velocities.*simulator_layout"):
         Simulator(offered(observation_space=spaces.Box(-1, 1, (5,))))
     muscle = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><body><joint name='j'/><geom size='1'/></body></worldbody>"
         "<actuator><general joint='j' dyntype='integrator'/></actuator></mujoco>"
     )
-    with pytest.raises(ValueError, match="1 states of their own"):
+    with pytest.raises(ValueError, match=r"actuators .*\b1 states"):
         Simulator(offered(model=muscle, observation_space=spaces.Box(-1, 1, (2,))))
 
 
@@ -113,5 +114,5 @@ def test_what_is_no_simulator_is_refused():
     ("observations", "actions"), [((3, 5), (3, 2, 1)), ((3, 4), (2, 2, 1)), ((3, 4), (3, 2, 2)), ((3, 4), (3, 2))]
 )
 def test_shapes_that_do_not_fit_are_named(observations, actions):
-    with pytest.raises(ValueError, match=r"observations \[n, 4\] and actions \[n, H, 1\], received shapes"):
+    with pytest.raises(ValueError, match=re.escape(f"{observations} and {actions}")):
         Simulator(offered()).trajectories(np.zeros(observations), np.zeros(actions))

@@ -23,7 +23,7 @@ from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.checkpoints.format import read_checkpoint
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.planning.controller import Controller
-from gym_dgpmpc.runs import run as _imported_before_the_fork  # noqa: F401  # with Matplotlib, which takes seconds
+from gym_dgpmpc.runs import training as _imported_before_the_fork  # noqa: F401  # with Matplotlib, which takes seconds
 from tests.faults.compare import checkpoint_differences, folder_differences, log_differences
 from tests.runs.toy import ToyPush
 

@@ -46,12 +46,12 @@ def test_one_bad_matrix_of_a_batch_is_enough_for_the_next_jitter():
 def test_a_value_that_is_not_finite_is_an_error(value, position):
     covariance = positive_definite(seeded(), 4)
     covariance[position] = covariance[position[::-1]] = value
-    with pytest.raises(FactorisationError, match=r"shape \(4, 4\).*not finite"):
+    with pytest.raises(FactorisationError, match=r"\(4, 4\).*not finite"):
         cholesky(covariance, ONE)
 
 
 def test_an_indefinite_matrix_is_an_error_that_names_the_largest_jitter():
-    with pytest.raises(FactorisationError, match=r"shape \(2, 2\).*jitter up to 0\.01"):
+    with pytest.raises(FactorisationError, match=r"\(2, 2\).*\b0\.01\b"):
         cholesky(torch.diag(torch.tensor([1.0, -0.1], dtype=torch.float64)), ONE)
 
 

@@ -152,7 +152,7 @@ def test_a_run_that_diverges_goes_back_and_takes_smaller_steps(step_size):
 
 def test_a_run_that_cannot_be_saved_says_so():
     data = waves(60, 0)
-    with pytest.raises(TrainingError, match=r"diverged 6 times.*step size 3\.125: .*60 transitions"):
+    with pytest.raises(TrainingError, match=r"\b6 times.*\b3\.125\b.*\b60 transitions"):
         train(*started(data, kernel="matern32"), data, 100, seeded(), InferenceSettings(step_size=100.0, gibbs_every=0))
 
 
@@ -204,14 +204,14 @@ def test_training_stops_when_held_out_data_say_that_it_is_enough():
 
 def test_held_out_rows_are_not_trained_on():
     rows = torch.arange(120, dtype=torch.float64).unsqueeze(1)
-    kept, held = training._split(Data(rows, rows + 1000), seeded())
+    kept, held = training._split_off_held_out(Data(rows, rows + 1000), seeded())
     assert held.num_rows == 12 and kept.num_rows == 108
     assert sorted(torch.cat([kept.x, held.x]).flatten().tolist()) == list(range(120))
     assert torch.equal(held.y, held.x + 1000) and torch.equal(kept.y, kept.x + 1000)
     # Not always the same ones, and never more than it takes.
-    assert not torch.equal(training._split(Data(rows, rows), seeded(1))[1].x, held.x)
+    assert not torch.equal(training._split_off_held_out(Data(rows, rows), seeded(1))[1].x, held.x)
     many = torch.zeros(10_000, 1, dtype=torch.float64)
-    assert training._split(Data(many, many), seeded())[1].num_rows == training.HELD_OUT[1]
+    assert training._split_off_held_out(Data(many, many), seeded())[1].num_rows == training.HELD_OUT[1]
 
 
 @pytest.mark.parametrize(("num_layers", "gibbs_every"), [(1, 0), (2, 0), (2, 20)])

@@ -244,13 +244,13 @@ def test_from_a_mean_at_a_bound_there_is_no_way_out(widths, where, pull, seed):
 def test_no_finite_score_is_an_error_that_says_how_many():
     cem = CEM(**bounds([-1.0], [1.0]), horizon=2, num_candidates=64)
     calls = iter([torch.zeros(64), torch.full((64,), math.nan)])
-    with pytest.raises(PlanningError, match=r"none of the 64 candidate.*iteration 2 \(64 non-finite"):
+    with pytest.raises(PlanningError, match=r"\b64 candidate.*iteration 2 \(64 "):
         cem.plan(lambda actions: next(calls), cem.initial_plan(), seeded())
 
 
 def test_an_objective_of_the_wrong_shape_is_named():
     cem = CEM(**bounds([-1.0], [1.0]), horizon=2, num_candidates=64)
-    with pytest.raises(ValueError, match=r"shape \(64,\), got \(64, 1\)"):
+    with pytest.raises(ValueError, match=r"objective .*\(64,\).*\(64, 1\)"):
         cem.plan(lambda actions: actions[:, :1, 0], cem.initial_plan(), seeded())
 
 
@@ -263,9 +263,9 @@ def test_what_a_shift_leaves_open_is_the_middle():
 @pytest.mark.parametrize(
     ("plan", "message"),
     [
-        (GaussianPlan(torch.zeros(3, 2), torch.ones(3, 2)), r"plan.mean must have shape \(4, 2\).*got \(3, 2\)"),
-        (GaussianPlan(torch.zeros(4, 2), torch.ones(4, 2).double()), r"plan.std must have.*float32, got .*float64"),
-        (GaussianPlan(torch.full((4, 2), math.nan), torch.ones(4, 2)), r"plan.mean must be finite, got .*nan"),
+        (GaussianPlan(torch.zeros(3, 2), torch.ones(3, 2)), r"plan\.mean .*\(4, 2\).*\(3, 2\)"),
+        (GaussianPlan(torch.zeros(4, 2), torch.ones(4, 2).double()), r"plan\.std .*float32.*float64"),
+        (GaussianPlan(torch.full((4, 2), math.nan), torch.ones(4, 2)), r"plan\.mean .*\bnan\b"),
     ],
 )
 def test_a_plan_of_another_planner_is_refused(plan, message):
@@ -281,17 +281,17 @@ def test_a_plan_of_another_planner_is_refused(plan, message):
     [
         ({"horizon": 0}, "horizon must be at least 1, got 0"),
         ({"num_elites": 0}, "num_elites must be at least 1, got 0"),
-        ({"num_iterations": 0}, "num_iterations must be at least 1, got 0"),
-        ({"num_elites": 301}, "num_elites must not exceed num_candidates, got 301 of 300"),
-        ({"smoothing": 1.0}, r"smoothing must lie in \[0, 1\), got 1.0"),
-        ({"smoothing": math.nan}, r"smoothing must lie in \[0, 1\), got nan"),
-        ({"min_std": -0.1}, "min_std must not be negative, got -0.1"),
-        (bounds([1.0], [-1.0]), r"bounds must be finite.*got \[1.0\] and \[-1.0\]"),
-        (bounds([-1.0], [math.inf]), r"bounds must be finite.*inf"),
-        (bounds([math.nan], [1.0]), r"bounds must be finite.*nan"),
-        (bounds([-3.4e38], [3.4e38]), r"bounds must be finite.*e\+38"),
-        (bounds([], []), r"vectors of one length, got \(0,\) and \(0,\)"),
-        ({"action_low": torch.tensor([-1.0]).double()}, "one floating-point dtype, got .*float64, .*float32"),
+        ({"num_iterations": 0}, "num_iterations .* 0$"),
+        ({"num_elites": 301}, "num_elites .*301.*300"),
+        ({"smoothing": 1.0}, r"smoothing .* 1\.0$"),
+        ({"smoothing": math.nan}, "smoothing .* nan$"),
+        ({"min_std": -0.1}, r"min_std .*-0\.1$"),
+        (bounds([1.0], [-1.0]), r"action_low .*\[1\.0\] and \[-1\.0\]"),
+        (bounds([-1.0], [math.inf]), r"bounds .*\[inf\]"),
+        (bounds([math.nan], [1.0]), r"bounds .*\[nan\]"),
+        (bounds([-3.4e38], [3.4e38]), r"bounds .*e\+38"),
+        (bounds([], []), r"action_low .*\(0,\) and \(0,\)"),
+        ({"action_low": torch.tensor([-1.0]).double()}, "action_low .*float64.*float32"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
@@ -300,5 +300,5 @@ def test_bad_arguments_are_named(arguments, message):
 
 
 def test_bounds_that_are_no_tensors(unchecked):
-    with pytest.raises(TypeError, match=r"must be tensors \(torch.as_tensor\), got ndarray and ndarray"):
+    with pytest.raises(TypeError, match=r"action_low .*ndarray and ndarray"):
         CEM(action_low=-np.ones(2), action_high=np.ones(2), horizon=3)

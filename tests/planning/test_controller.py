@@ -144,7 +144,7 @@ def test_settings_are_checked_when_they_are_set(setting, value, error, unchecked
 
 def test_a_planner_of_other_actions_is_refused():
     planner = RandomShooting(torch.zeros(2), torch.ones(2), horizon=4)
-    with pytest.raises(ValueError, match="actions of 2 numbers, the action space has 1"):
+    with pytest.raises(ValueError, match=r"planner .*\b2\b.*action space .*\b1\b"):
         Controller(Drifting(), planner, SPACE)
 
 
@@ -161,9 +161,9 @@ class Counted(NamedTuple):
 @pytest.mark.parametrize(
     ("plan", "error", "message"),
     [
-        (torch.zeros(4, 1), TypeError, "RandomShooting must be NamedTuples.*tensor"),
-        (Counted(3, torch.zeros(4, 1)), TypeError, r"RandomShooting must be NamedTuples.*count=3"),
-        (Aged(torch.zeros(4, 1), torch.zeros(4, 1)), ValueError, "'age'"),
+        (torch.zeros(4, 1), TypeError, r"RandomShooting .*tensor\("),
+        (Counted(3, torch.zeros(4, 1)), TypeError, "RandomShooting .*count=3"),
+        (Aged(torch.zeros(4, 1), torch.zeros(4, 1)), ValueError, "RandomShooting .*'age'"),
     ],
 )
 def test_plans_that_cannot_be_carried_are_refused(plan, error, message, unchecked):
@@ -176,8 +176,8 @@ def test_plans_that_cannot_be_carried_are_refused(plan, error, message, unchecke
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        (torch.full((4, 1), math.nan), "not finite: .*nan"),
-        (torch.tensor([[0.0], [0.0], [0.0], [math.inf]]), "not finite: .*inf"),
+        (torch.full((4, 1), math.nan), "actions .*nan"),
+        (torch.tensor([[0.0], [0.0], [0.0], [math.inf]]), "actions .*inf"),
         (torch.zeros(3, 1), r"\(3, 1\)"),
         (torch.zeros(4, 1).double(), "float64"),
     ],
@@ -189,8 +189,8 @@ def test_what_a_planner_returns_is_checked(actions, message):
         control.act(TASK, OBSERVATION, control.cold, seeded())
 
 
-def test_a_reward_that_is_never_finite_names_the_observation():
-    task = a_task(lambda observation, action, next_observation: math.nan * next_observation[..., 0])
+def test_returns_that_are_never_finite_name_the_observation():
     control = controller()
-    with pytest.raises(PlanningError, match=r"finite score.*observation \[0.5\]"):
-        control.act(task, OBSERVATION, control.cold, seeded())
+    control.dynamics.draw = lambda *_: lambda observation, action, step: math.nan * observation
+    with pytest.raises(PlanningError, match=r"finite.*observation \[0\.5\]"):
+        control.act(TASK, OBSERVATION, control.cold, seeded())

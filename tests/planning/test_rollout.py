@@ -155,7 +155,7 @@ def test_a_sampler_that_takes_whole_sequences_is_asked_once():
 
 
 def test_trajectories_of_another_shape_are_refused():
-    with pytest.raises(ValueError, match=r"\[H \+ 1, P, K, S\] = \(4, 5, 3, 2\), got \(4, 2, 3, 2\)"):
+    with pytest.raises(ValueError, match=r"trajectories .*\(4, 5, 3, 2\).*\(4, 2, 3, 2\)"):
         rollout(InOneGo(torch.zeros(4, 2, 3, 2)), torch.zeros(2), torch.zeros(3, 3, 1), 5)
 
 
@@ -243,10 +243,10 @@ class TestWhatAUserMayGetWrong:
     @pytest.mark.parametrize(
         ("reward", "error", "message"),
         [
-            (lambda s, a, n: n[..., :1], ValueError, r"\[H, P, K\] = \(4, 5, 3\), got shape \(4, 5, 3, 1\)"),
-            (lambda s, a, n: n.sum(), ValueError, r"got shape \(\), torch.float32"),
-            (lambda s, a, n: n[..., 0].long(), ValueError, r"reward_fn must return a floating-point.*torch.int64"),
-            (lambda s, a, n: n[..., 0].numpy(), TypeError, "reward_fn must return a tensor, got ndarray"),
+            (lambda s, a, n: n[..., :1], ValueError, r"reward_fn .*\(4, 5, 3\).*\(4, 5, 3, 1\)"),
+            (lambda s, a, n: n.sum(), ValueError, r"reward_fn .* \(\), torch\.float32"),
+            (lambda s, a, n: n[..., 0].long(), ValueError, r"reward_fn .*torch\.int64"),
+            (lambda s, a, n: n[..., 0].numpy(), TypeError, "reward_fn .*ndarray"),
         ],
     )
     def test_rewards(self, reward, error, message):
@@ -256,9 +256,9 @@ class TestWhatAUserMayGetWrong:
     @pytest.mark.parametrize(
         ("ended", "error", "message"),
         [
-            (lambda n: n > 0, ValueError, r"\(4, 5, 3\), got shape \(4, 5, 3, 2\)"),
-            (lambda n: n[..., 0], ValueError, r"terminated_fn must return a boolean.*torch.float32"),
-            (lambda n: False, TypeError, "terminated_fn must return a tensor, got bool"),
+            (lambda n: n > 0, ValueError, r"terminated_fn .*\(4, 5, 3\).*\(4, 5, 3, 2\)"),
+            (lambda n: n[..., 0], ValueError, r"terminated_fn .*torch\.float32"),
+            (lambda n: False, TypeError, "terminated_fn .*bool$"),
         ],
     )
     def test_terminations(self, ended, error, message):
@@ -266,15 +266,15 @@ class TestWhatAUserMayGetWrong:
             self.score(terminated_fn=ended)
 
     def test_samplers_whose_result_would_be_broadcast(self):
-        with pytest.raises(ValueError, match=r"\[P, K, S\] = \(5, 3, 2\), got \(3, 2\)"):
+        with pytest.raises(ValueError, match=r"sampler .*\(5, 3, 2\).* \(3, 2\)"):
             self.score(sampler=lambda s, a, step: s[0])
 
     @pytest.mark.parametrize(
         ("observation", "particles", "message"),
         [
-            (torch.zeros(2), 0, "num_particles must be at least 1, got 0"),
-            (torch.zeros(2, 1), 1, r"floating-point vector, got shape \(2, 1\)"),
-            (torch.zeros(2, dtype=torch.int64), 1, "floating-point vector.*torch.int64"),
+            (torch.zeros(2), 0, "num_particles .* 0$"),
+            (torch.zeros(2, 1), 1, r"observation .*\(2, 1\)"),
+            (torch.zeros(2, dtype=torch.int64), 1, r"observation .*torch\.int64"),
         ],
     )
     def test_starts(self, observation, particles, message, unchecked):

@@ -54,9 +54,9 @@ def test_the_suffix_decides_the_format(tmp_path):
 
 
 def test_learning_curve_of_nothing(tmp_path):
-    with pytest.raises(ValueError, match="at least one episode"):
+    with pytest.raises(ValueError, match="episode"):
         plot_learning_curve([], tmp_path / "a.png", title="")
-    with pytest.raises(ValueError, match="2 returns, but the steps of 1"):
+    with pytest.raises(ValueError, match=r"episode_steps .*\b2\b.*\b1$"):
         plot_learning_curve([1.0, 2.0], tmp_path / "a.png", title="", episode_steps=[200])
 
 
@@ -117,9 +117,9 @@ def test_fan_leaves_out_what_never_changes(drawn, tmp_path):
 
 
 def test_fan_of_nothing(tmp_path):
-    with pytest.raises(ValueError, match="at least one forecast"):
+    with pytest.raises(ValueError, match="forecast"):
         plot_prediction_fan([], tmp_path / "a.png", labels=[], title="")
-    with pytest.raises(ValueError, match="1 labels for an observation of 2"):
+    with pytest.raises(ValueError, match=r"labels .*\b2\b.*\b1$"):
         plot_prediction_fan([forecast()], tmp_path / "a.png", labels=["a"], title="")
 
 

@@ -1,7 +1,6 @@
 """Risk-sensitive rewards: planned with, reported beside the task's own, on any environment with a known reward."""
 
 import math
-import re
 
 import gymnasium
 import numpy as np
@@ -128,20 +127,20 @@ class Picture(Bare):
 @pytest.mark.parametrize(
     ("env", "arguments", "message"),
     [
-        (Bare, {"angle_index": 0}, "has no attribute 'reward_fn' and its reward is not among the known ones"),
-        (Picture, {"angle_index": 0}, "observations must be vectors to have an angle at an index; the space is Box(0"),
-        (VelocityHalfCheetahEnv, {"angle_index": 18}, "angle_index must be from 0 to 17; got 18"),
-        (VelocityHalfCheetahEnv, {"angle_index": -1}, "angle_index must be from 0 to 17; got -1"),
-        (VelocityHalfCheetahEnv, {"angle_index": 2, "angle_step": 0.0}, "angle_step must be a positive number, in rad"),
-        (VelocityHalfCheetahEnv, {"angle_index": 2, "angle_step": math.inf}, "in rad; got inf"),
-        (lambda: gymnasium.make("HalfCheetah-v5"), {"angle_index": 1}, "its reward is not among the known ones"),
+        (Bare, {"angle_index": 0}, "Bare.*'reward_fn'"),
+        (Picture, {"angle_index": 0}, r"observations .*Box\(0, 255, \(4, 4, 3\)"),
+        (VelocityHalfCheetahEnv, {"angle_index": 18}, r"angle_index .*\b17\b.* 18$"),
+        (VelocityHalfCheetahEnv, {"angle_index": -1}, r"angle_index .*\b17\b.* -1$"),
+        (VelocityHalfCheetahEnv, {"angle_index": 2, "angle_step": 0.0}, r"angle_step .* 0\.0$"),
+        (VelocityHalfCheetahEnv, {"angle_index": 2, "angle_step": math.inf}, "angle_step .* inf$"),
+        (lambda: gymnasium.make("HalfCheetah-v5"), {"angle_index": 1}, "HalfCheetah.*'reward_fn'"),
     ],
 )
 def test_bad_arguments_are_named(env, arguments, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
+    with pytest.raises(ValueError, match=message):
         RiskSensitiveReward(env(), **arguments)
 
 
 def test_an_index_of_a_wrong_type_is_named(unchecked):
-    with pytest.raises(ValueError, match=re.escape("angle_index must be an integer; got 1.5")):
+    with pytest.raises(ValueError, match=r"angle_index .* 1\.5$"):
         RiskSensitiveReward(VelocityHalfCheetahEnv(), angle_index=1.5)

@@ -1,7 +1,7 @@
 """Whole rollouts of a pathwise draw in compiled code: `native/rollout.cpp`, called once per thread and objective.
 
-`PathwiseSampler` evaluates its functions with PyTorch, one step of a plan at a time; what is here takes the same
-functions through all steps at once, several times faster on a CPU and equal to it up to single-precision rounding.
+`PathwiseSampler` evaluates its functions with PyTorch, one step of a plan at a time. The code here takes the same
+functions through all steps at once, several times faster on a CPU, and differs only by single-precision rounding.
 The compiled code has kernels of its own, which it is asked for by name; one that it does not have is left to PyTorch.
 """
 
@@ -106,16 +106,16 @@ class CompiledRollout:
         coordinates: raw states to standardised coordinates and back, float32.
 
     Raises:
-        RuntimeError: there is no compiled code, or not for a layer's kernel; see `is_available`.
+        RuntimeError: there is no compiled code, or it lacks a layer's kernel; see `is_available`.
     """
 
     def __init__(self, layers: Sequence[PathwiseLayer], coordinates: Coordinates):
         library = _library()
         if library is None:
-            raise RuntimeError("there is no compiled code on this machine: ask is_available first")
+            raise RuntimeError("no compiled code on this machine: check is_available() first")
         self._library, units = library, int(library.units())
         encoder, first = coordinates.encoder, layers[0]
-        self._kept: list[Tensor] = []  # the memory that the structures point into
+        self._kept_alive: list[Tensor] = []  # the memory that the structures point into
         self._layers = (_Layer * len(layers))(*(self._packed(layer, units) for layer in layers))
         vectors = encoder.spec.body_frame
         along_body = {x: (FORWARDS, k) for k, (_, x, _) in enumerate(vectors)}
@@ -158,7 +158,7 @@ class CompiledRollout:
 
         Raises:
             ValueError: the sizes are not those of the draw, or the plan has more steps than it has functions.
-            MemoryError: there was no memory for a few kilobytes per thread.
+            MemoryError: a few kilobytes per thread could not be allocated.
         """
         self._check_sizes(observation, actions)
         num_candidates, horizon, _ = actions.shape
@@ -179,11 +179,11 @@ class CompiledRollout:
         ranges = [(first, min(first + share, num_candidates)) for first in range(0, num_candidates, share)]
         failed = run(*ranges[0]) if len(ranges) == 1 else sum(_threads(threads).map(lambda r: run(*r), ranges))
         if failed:
-            raise MemoryError("there was no memory for the scratch space of a rollout")
+            raise MemoryError("could not allocate the scratch space of a rollout, a few kilobytes for each thread")
         return states
 
     def _check_sizes(self, observation: Tensor, actions: Tensor) -> None:
-        """The compiled code believes every size, and would read beyond the arrays."""
+        """Refuse wrong sizes: the compiled code trusts them, and would read beyond the arrays."""
         task = self._task
         if observation.shape != (task.observation_size,):
             raise ValueError(
@@ -193,7 +193,7 @@ class CompiledRollout:
             raise ValueError(f"the actions must have the shape [K, H, {task.action_size}], got {tuple(actions.shape)}")
         if task.num_functions > 1 and actions.shape[1] > task.num_functions:
             raise ValueError(
-                f"these worlds were drawn for plans of at most {task.num_functions} steps, got actions for "
+                f"the actions must not exceed the {task.num_functions} steps that these worlds were drawn for, got "
                 f"{actions.shape[1]}"
             )
 
@@ -201,7 +201,7 @@ class CompiledRollout:
         """A layer in the layout of the compiled code, M and F padded to whole blocks of functions that are zero."""
         number, padded = _kernel_number(layer.kernel), _padded(layer, units)
         if number is None:
-            raise RuntimeError(f"the compiled code has no kernel {layer.kernel.name!r}: ask is_available first")
+            raise RuntimeError(f"the compiled code has no kernel {layer.kernel.name!r}: check is_available first")
         return _Layer(
             number,
             layer.kernel.argument_scale,
@@ -216,12 +216,12 @@ class CompiledRollout:
         )
 
     def _floats(self, values: Tensor) -> "ctypes._Pointer[ctypes.c_float]":
-        self._kept.append(values.to(torch.float32).contiguous())
-        return _pointer(self._kept[-1])
+        self._kept_alive.append(values.to(torch.float32).contiguous())
+        return _pointer(self._kept_alive[-1])
 
     def _integers(self, values: Tensor) -> "ctypes._Pointer[ctypes.c_int64]":
-        self._kept.append(values.to(torch.int64).contiguous())
-        return ctypes.cast(self._kept[-1].data_ptr(), _Integers)
+        self._kept_alive.append(values.to(torch.int64).contiguous())
+        return ctypes.cast(self._kept_alive[-1].data_ptr(), _Integers)
 
 
 @cache
@@ -236,7 +236,7 @@ def _library() -> ctypes.CDLL | None:
 
 
 def _kernel_number(kernel: Kernel) -> int | None:
-    """What the compiled code calls this kernel; None if it has none of that name."""
+    """The number of this kernel in the compiled code; None if that does not have it."""
     library = _library()
     number = -1 if library is None else int(library.kernel_number(kernel.name.encode()))
     return None if number < 0 else number
@@ -245,8 +245,8 @@ def _kernel_number(kernel: Kernel) -> int | None:
 @cache
 def _warn_of_unknown_kernel(name: str) -> None:
     warnings.warn(
-        f"plans are made without compiled code, several times slower, because it has no kernel {name!r}: add it to "
-        "dynamics/deep_gp/native/rollout.cpp; compile=False leaves out this warning",
+        f"planning does without compiled code, several times slower, because that has no kernel {name!r}: add it to "
+        "dynamics/deep_gp/native/rollout.cpp, or pass compile=False to silence this warning",
         stacklevel=2,
     )
 

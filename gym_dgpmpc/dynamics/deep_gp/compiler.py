@@ -1,4 +1,4 @@
-"""Builds the package's C++ source with the compiler of the machine it runs on, once, and loads it.
+"""Builds the package's C++ source once, with the compiler of the machine that it runs on, and loads it.
 
 The result is kept in the user's cache folder (`XDG_CACHE_HOME`, by default `~/.cache`), under a name that says which
 source, compiler, flags and processor it was built from and for. Used by `compiled_rollout.py`; without a compiler the
@@ -25,20 +25,19 @@ BUILD_TIMEOUT = 120.0
 
 
 class CompilerError(RuntimeError):
-    """There is no usable compiler, or it could not build the source; never leaves this module's `load`."""
+    """No compiler can be used, or it could not build the source. `load` turns it into a warning."""
 
 
 @functools.cache
 def load(name: str) -> ctypes.CDLL | None:
-    """The library built from ``native/NAME.cpp``; None, with one warning, where it cannot be built."""
+    """The library built from ``native/NAME.cpp``; None, with one warning, if it cannot be built."""
     source = files("gym_dgpmpc.dynamics.deep_gp").joinpath("native", f"{name}.cpp").read_bytes()
     try:
-        return ctypes.CDLL(str(_built(name, source)))
+        return ctypes.CDLL(str(_build(name, source)))
     except (CompilerError, OSError, subprocess.SubprocessError) as error:
         warnings.warn(
-            f"plans are made without compiled code, several times slower, because {error}. A C++ compiler (g++ or "
-            "clang++, or the one that the environment variable CXX names) makes them fast; compile=False leaves out "
-            "this warning",
+            f"planning does without compiled code, several times slower, because {error}. Install a C++ compiler "
+            "(g++ or clang++), or name one in the environment variable CXX; compile=False silences this warning",
             stacklevel=2,
         )
         return None
@@ -48,7 +47,7 @@ def find_compiler() -> list[str]:
     """The compiler's command: what CXX says, else the first of `COMPILERS` there is.
 
     Raises:
-        CompilerError: there is none.
+        CompilerError: no compiler was found.
     """
     asked = os.environ.get("CXX", "").split()
     for command in [asked] if asked else [[name] for name in COMPILERS]:
@@ -73,11 +72,11 @@ def cache_folder() -> Path:
         return Path(temporary)
     status = folder.stat()
     if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o022):
-        raise CompilerError(f"{folder} can be written to by other users: remove it, or set XDG_CACHE_HOME")
+        raise CompilerError(f"other users can write to {folder}: remove it, or set XDG_CACHE_HOME")
     return folder
 
 
-def _built(name: str, source: bytes) -> Path:
+def _build(name: str, source: bytes) -> Path:
     """The path of the library, built if it is not in the cache."""
     compiler = find_compiler()
     # All that the compiler predefines with these flags: its version and the processor's instructions among them.

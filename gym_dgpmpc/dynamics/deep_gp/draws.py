@@ -52,7 +52,7 @@ class ConditionalSampler:
     ) -> Float[Tensor, "P K S"]:
         (model, factors), whitened = self._posterior
         x = self._coordinates.encode(observation, action).to(factors[0].dtype)
-        # Jointly drawn points share a covariance, which one that is not finite would make useless for all.
+        # Jointly drawn points share a covariance, which a single point that is not finite would spoil for all.
         lost = ~x.isfinite().all(-1, keepdim=True)
         x = x.masked_fill(lost, 0.0)
         last = len(factors) - 1
@@ -164,7 +164,7 @@ class PathwiseSampler:
 
     @cached_property
     def _in_weights(self) -> list[tuple[Tensor, Tensor]]:
-        """Of each layer, from (x, |x|^2, 1) to the kernel's argument "D+2 M" and to the features' phases "D+2 F"."""
+        """Each layer's maps from (x, |x|^2, 1) to the kernel's argument "D+2 M" and to the features' phases "D+2 F"."""
         weights = []
         for layer in self.layers:
             square = torch.full_like(layer.offsets, layer.kernel.argument_scale)
@@ -199,7 +199,7 @@ class CompiledPathwiseSampler(PathwiseSampler):
     """A `PathwiseSampler` that offers whole trajectories in compiled code; float32 on the CPU.
 
     Raises:
-        RuntimeError: there is no compiled code on this machine; see `compiled_rollout.is_available`.
+        RuntimeError: this machine has no compiled code; see `compiled_rollout.is_available`.
     """
 
     def __init__(

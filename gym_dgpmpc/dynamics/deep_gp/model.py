@@ -32,10 +32,11 @@ from gym_dgpmpc.dynamics.deep_gp.draws import (
 )
 from gym_dgpmpc.dynamics.deep_gp.start import initial_model, relocate, restandardise
 from gym_dgpmpc.dynamics.learner import Learner
-from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
+from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all
 from gym_dgpmpc.gp.kernels import Kernel, find_kernel
+from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.inference import mcem, sghmc, training
 from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
 from gym_dgpmpc.inference.mcem import InferenceSettings
@@ -45,12 +46,12 @@ from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, Transition
 class _Fitted(NamedTuple):
     """What a fit leaves behind, and a `resample` moves on."""
 
-    factorised: Factorised  # of which a saved state has the model alone
+    factorised: Factorised  # a saved state holds only its model
     normalisers: tuple[Normaliser, Normaliser]
     chain: sghmc.SGHMCState
     pool: Tensor  # "num_samples V", a ring
     oldest: int  # the row of the pool that the next sample replaces
-    step_size: float  # of SG-HMC: the one asked for, unless training had to take smaller steps
+    step_size: float  # of SG-HMC: the setting, unless training had to take smaller steps
 
 
 class _Standardised(NamedTuple):
@@ -75,27 +76,28 @@ class DeepGPDynamics(Learner[_Fitted]):
     """Implements `DynamicsModel` with a deep Gaussian process of L layers.
 
     Args:
-        observation_size: S.
-        action_size: A.
+        observation_size: numbers in an observation, S.
+        action_size: numbers in an action, A.
         observation_spec: how to read the observation.
-        num_layers: L, layers of the deep GP, at least 1.
-        kernel: of every layer, with one lengthscale per input; a name in `gp.kernels.KERNELS`, such as "matern32".
-        num_inducing: M, inducing points per layer.
-        draw: how a world is drawn from the posterior: "pathwise" (functions), "joint" (values, jointly across the
-            candidate sequences, as in the paper) or "marginal" (values, independently).
-        refresh: for "pathwise": a new function per particle at each "step" of a plan, or one for the whole "plan".
-        num_features: F, random features of a pathwise draw; its prior covariance errs by F^-1/2.
-        first_training_iterations: training iterations (one SG-HMC and one Adam step each) of the first fit.
-        training_iterations: training iterations of each later fit.
-        num_samples: posterior samples kept, the pool; the particles of a plan are drawn from them.
-        sample_spacing: SG-HMC steps between two samples of the pool.
-        resample_steps: SG-HMC steps after each control step; 0 keeps the posterior as it is within an episode.
-        resample_samples: samples of the pool that one `resample` replaces, if the last layer is drawn exactly; at
-            least 1 (``resample_steps=0`` turns re-sampling off).
-        relocate: move the inducing inputs to the grown data's cluster centres before each later fit.
-        compile: roll pathwise draws out in compiled code, which a C++ compiler builds once in a few seconds; without
-            one, for a kernel that it does not have, or for another precision or device, PyTorch does it, several times
-            slower.
+        num_layers: layers of the deep GP, L; with 1 it is an ordinary sparse GP.
+        kernel: covariance function of every layer, from the smoothest functions to the roughest: rbf, matern72,
+            matern52, matern32 or matern12.
+        num_inducing: inducing points per layer, M; more of them follow finer detail and cost more time.
+        draw: how a world is drawn from the posterior: "pathwise" (whole functions), "joint" (values, jointly over the
+            candidate sequences, as in the paper) or "marginal" (values, each candidate on its own).
+        refresh: when a particle of a "pathwise" draw gets a new function: at each "step" of a plan, or once per "plan".
+        num_features: random features of a "pathwise" draw, F; the error of its prior covariance falls as F^-1/2.
+        first_training_iterations: training iterations of the first fit, of one SG-HMC and one Adam step each.
+        training_iterations: training iterations of each later fit, which goes on from the fit before.
+        num_samples: posterior samples kept (the pool); the worlds of a plan are drawn from them.
+        sample_spacing: SG-HMC steps between two samples of the pool; more of them make the samples less alike.
+        resample_steps: SG-HMC steps after each control step, by which the posterior follows the new data; 0 keeps the
+            posterior as it is within an episode.
+        resample_samples: samples of the pool that are replaced after each control step, at least 1, if the last layer
+            is drawn exactly.
+        relocate: move the inducing inputs to the cluster centres of the grown data before each later fit.
+        compile: roll "pathwise" draws out in compiled code, several times faster; a C++ compiler builds it once in a
+            few seconds. PyTorch does it where there is no compiler, on a GPU, and for kernels of your own.
         dtype: precision of rollouts; training and every factorisation are in float64.
         device: where tensors live.
         **inference: the settings of `InferenceSettings`, each as a keyword argument of its own.
@@ -104,7 +106,7 @@ class DeepGPDynamics(Learner[_Fitted]):
         draw_kind: the setting ``draw``; `draw` is the method.
 
     Raises:
-        TypeError: there is no such setting.
+        TypeError: a setting is unknown.
         ValueError: a setting is out of its range.
     """
 
@@ -172,7 +174,7 @@ class DeepGPDynamics(Learner[_Fitted]):
 
         Raises:
             ValueError: there are no transitions.
-            TrainingError: training diverged however small its steps; the model is as it was.
+            TrainingError: training diverged with ever smaller steps; the model is as it was.
         """
         normalisers, standardised = self._standardised(data)
         if self._fitted is None:
@@ -207,7 +209,7 @@ class DeepGPDynamics(Learner[_Fitted]):
         dropped, and the pool stays as it was.
 
         Returns:
-            ``resamplings_dropped``: 1 if that happened, otherwise 0; nothing if there are no steps to take.
+            ``resamplings_dropped``: 1 if that happened, otherwise 0; an empty mapping if there are no steps to take.
 
         Raises:
             RuntimeError: the model was not fitted.
@@ -217,7 +219,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             return {}
         try:
             chain, newest = self._newest_samples(fitted, data, generator)
-        except FactorisationError:  # of an exact draw: the steps before it led to what is not finite
+        except FactorisationError:  # in an exact draw: the steps before it left values that are not finite
             return {"resamplings_dropped": 1.0}
         if not training.is_plausible(newest):
             return {"resamplings_dropped": 1.0}
@@ -267,9 +269,9 @@ class DeepGPDynamics(Learner[_Fitted]):
         if self._fitted is None:
             return {}
         fitted, model = self._fitted, self._fitted.factorised.model
-        # The pool is the one tensor that changes in place, and a state should not change after it was taken.
+        # The pool is the one tensor that changes in place, which must not change a state taken before.
         state: StateDict = {"pool": fitted.pool.clone(), "oldest": fitted.oldest, "log_noise": model.log_noise}
-        if fitted.step_size != self.inference.step_size:  # states of before it was kept do not have it either
+        if fitted.step_size != self.inference.step_size:  # older states do not have this entry
             state["step_size"] = fitted.step_size
         for index, layer in enumerate(model.layers):
             state |= {f"layers.{index}.{name}": value for name, value in layer.parameters().items()}
@@ -291,8 +293,9 @@ class DeepGPDynamics(Learner[_Fitted]):
         def take(name: str, *shape: int) -> Tensor:
             return take_tensor(state, name, shape, device)
 
+        shapes = parameter_shapes(self.num_inducing, size)
         layers = (
-            take_layer(state, f"layers.{i}.", self.kernel, self.num_inducing, size, device)
+            Layer(self.kernel, **take_tensors(state, shapes, device, prefix=f"layers.{i}."))
             for i in range(self.num_layers)
         )
         model = DeepGP(tuple(layers), take("log_noise", num_targets))

@@ -19,7 +19,7 @@ from gym_dgpmpc.gp.kernels import Kernel
 from gym_dgpmpc.gp.layer import Layer, conditional, factorise
 
 MOST_CLUSTERED = 10_000
-"""Of more rows than this a random subset is clustered, so that the cost does not grow with the data."""
+"""The most rows to cluster: of more than this a random subset is taken, so that the cost stays the same."""
 
 INNER_VARIANCE = 0.01
 NOISE_VARIANCE = 0.05
@@ -29,10 +29,10 @@ def initial_model(kernel: Kernel, data: Data, num_layers: int, num_inducing: int
     """Hyperparameters before the first fit, for standardised data.
 
     Inducing inputs by k-means of the inputs, in every layer (the inner layers start near the identity); lengthscales
-    sqrt(D); kernel variance 0.01 in the inner layers and 1 in the last; noise variance 0.05 of a target's.
+    sqrt(D); kernel variance 0.01 in the inner layers and 1 in the last; noise variance 0.05 times a target's.
     """
     size = data.x.shape[1]
-    centres = cluster(_clustered(data.x, generator), num_inducing, generator)
+    centres = cluster(_rows_to_cluster(data.x, generator), num_inducing, generator)
     log_lengthscale = data.x.new_full((size,), 0.5 * math.log(size))
 
     def layer(variance: float) -> Layer:
@@ -59,7 +59,7 @@ def cluster(x: Float[Tensor, "N D"], num_clusters: int, generator: torch.Generat
     return torch.from_numpy(centres).to(x)
 
 
-def _clustered(x: Float[Tensor, "N D"], generator: torch.Generator) -> Float[Tensor, "n D"]:
+def _rows_to_cluster(x: Float[Tensor, "N D"], generator: torch.Generator) -> Float[Tensor, "n D"]:
     if x.shape[0] <= MOST_CLUSTERED:
         return x
     return x[torch.randperm(x.shape[0], generator=generator, device=x.device)[:MOST_CLUSTERED]]
@@ -105,7 +105,7 @@ def relocate(
     New centres come from k-means of the inputs propagated by the layers' means; the new inducing outputs are the old
     conditional mean there.
     """
-    layers, outputs, x = [], [], _clustered(data.x, generator)
+    layers, outputs, x = [], [], _rows_to_cluster(data.x, generator)
     last = len(model.layers) - 1
     for index, (layer, v) in enumerate(zip(model.layers, model.split(whitened), strict=True)):
         factor = factorise(layer)

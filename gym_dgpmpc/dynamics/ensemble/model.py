@@ -26,7 +26,7 @@ from gym_dgpmpc.dynamics.ensemble.network import (
 )
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner
-from gym_dgpmpc.dynamics.state import take_normaliser, take_tensor
+from gym_dgpmpc.dynamics.state import take_normaliser, take_tensors
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
 
@@ -41,7 +41,7 @@ class _Fitted(NamedTuple):
     network: Ensemble
     inputs: Normaliser
     moments: dict[str, _Moments]
-    num_updates: int  # of Adam, over all trainings
+    num_updates: int  # Adam steps over all trainings
 
 
 class EnsembleDynamics(Learner[_Fitted]):
@@ -51,22 +51,23 @@ class EnsembleDynamics(Learner[_Fitted]):
     left them. Within an episode nothing is learned.
 
     Args:
-        observation_size: S.
-        action_size: A.
+        observation_size: numbers in an observation, S.
+        action_size: numbers in an action, A.
         observation_spec: how to read the observation.
-        num_members: B, networks.
-        num_hidden_layers: layers between inputs and outputs.
-        hidden_size: width of each of them.
-        weight_decay: of every layer's weights, the last layer's included; the loss holds decay / 2 |W|^2.
-        learning_rate: of Adam.
-        batch_size: transitions per member and gradient.
-        num_epochs: passes over the data in one training.
+        num_members: networks in the ensemble, B.
+        num_hidden_layers: hidden layers of each network.
+        hidden_size: units of each hidden layer.
+        weight_decay: weight decay of every layer, from the first to the output layer, so one number more than there are
+            hidden layers; the loss holds decay / 2 |W|^2.
+        learning_rate: learning rate of Adam.
+        batch_size: transitions in a minibatch of each network.
+        num_epochs: passes over the data in each training.
         draw: how particles move through the networks: "TS1", each through one drawn anew at each step; "TSinf", each
             through its own for the whole plan; "DS", each by its own draw from the mean and variance of all; "MM", as
             DS, then a candidate's particles are replaced by draws from their mean and variance; "expectation", along
             the mean.
-        half_precision: in rollouts, compute the layers between the first and the last in bfloat16: faster by a
-            multiple on processors with instructions for it, and off by some 0.3 % of a prediction.
+        half_precision: compute the layers between the first and the last in bfloat16 in rollouts; several times faster
+            on processors with instructions for it, and off by some 0.3 % of a prediction.
         dtype: precision of all else in rollouts; networks are trained in float32.
         device: where tensors live.
 
@@ -104,7 +105,7 @@ class EnsembleDynamics(Learner[_Fitted]):
         )
         if len(weight_decay) != num_hidden_layers + 1 or not all(0 <= decay < math.inf for decay in weight_decay):
             raise ValueError(
-                f"weight_decay must hold one number that is not negative for each of the {num_hidden_layers} hidden "
+                f"weight_decay must hold one number of at least 0 for each layer: {num_hidden_layers} for the hidden "
                 f"layers and one for the last, received {weight_decay}"
             )
         if not 0 < learning_rate < math.inf:
@@ -142,7 +143,7 @@ class EnsembleDynamics(Learner[_Fitted]):
         }
 
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
-        """Nothing: the networks are trained between episodes only.
+        """Do nothing: the networks are trained between episodes only.
 
         Raises:
             RuntimeError: the model was not fitted.
@@ -166,8 +167,8 @@ class EnsembleDynamics(Learner[_Fitted]):
         if self.draw_kind in ("TS1", "TSinf"):
             if num_particles < 1 or num_particles % self.num_members:
                 raise ValueError(
-                    f"the draw {self.draw_kind} needs a multiple of the ensemble's {self.num_members} members as "
-                    f"number of particles, received {num_particles}"
+                    f"the draw {self.draw_kind} needs a number of particles that is a multiple of its "
+                    f"{self.num_members} networks, received {num_particles}"
                 )
             shuffle = self.draw_kind == "TS1" and self.num_members > 1
             return EnsembleSampler(network, coordinates, generator, shuffle=shuffle)
@@ -201,13 +202,11 @@ class EnsembleDynamics(Learner[_Fitted]):
 
         shapes = self._shapes()
         device, single = self.device, torch.float32
-        network = Ensemble.from_parameters(
-            {name: take_tensor(state, name, shape, device, single) for name, shape in shapes.items()}
-        )
+        network = Ensemble.from_parameters(take_tensors(state, shapes, device, single))
         inputs = take_normaliser(state, "inputs", self.encoder.input_size, device)
         moments = {
             name: _Moments(
-                *(take_tensor(state, f"adam.{name}.{key}", shape, device, single) for key in _Moments._fields)
+                **take_tensors(state, dict.fromkeys(_Moments._fields, shape), device, single, prefix=f"adam.{name}.")
             )
             for name, shape in shapes.items()
         }
@@ -231,7 +230,7 @@ class EnsembleDynamics(Learner[_Fitted]):
         """Every member's own bootstrap, shuffled for each epoch; the mean loss of the last epoch."""
         parameters = {name: value.clone().requires_grad_() for name, value in network.parameters().items()}
         network = Ensemble.from_parameters(parameters)
-        # Adam's own decay adds decay * W to the gradient, which is that of decay / 2 |W|^2, without a pass of its own.
+        # Adam's own decay adds decay * W to the gradient, the gradient of decay / 2 |W|^2, without a pass of its own.
         groups: list[dict[str, Any]] = [
             {"params": [weight], "weight_decay": decay}
             for weight, decay in zip(network.weights, self.weight_decay, strict=True)

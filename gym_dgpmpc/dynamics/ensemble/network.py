@@ -92,7 +92,7 @@ def predict(ensemble: Ensemble, x: Float[Tensor, "B n D"]) -> Prediction:
     """Mean and log variance, the latter kept softly between the bounds: v <- max - softplus(max - v), then likewise.
 
     Args:
-        x: standardised inputs, those of each member. Each layer computes in the precision of its weights.
+        x: standardised inputs, separate ones for each member. Each layer computes in the precision of its weights.
     """
     if not torch.is_grad_enabled() and x.device.type == "cpu" and x.shape[1] > ROWS_AT_ONCE:
         predictions = [predict(ensemble, rows) for rows in x.split(ROWS_AT_ONCE, dim=1)]

@@ -20,10 +20,10 @@ from gym_dgpmpc.dynamics.deep_gp.start import NOISE_VARIANCE, restandardise
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.sparse_gp.moment_matching import MomentMatchingSampler
-from gym_dgpmpc.dynamics.state import normalisers_state, take_layer, take_normaliser, take_tensor
+from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.gp.deep_gp import DeepGP
 from gym_dgpmpc.gp.kernels import RBF, Kernel, find_kernel
-from gym_dgpmpc.gp.layer import Layer
+from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.gp.moments import Predictor
 from gym_dgpmpc.gp.sgpr import SparsePosterior, shrinkage, sparse_posterior, sparse_predict
 from gym_dgpmpc.inference.lbfgs import maximise_bound
@@ -46,20 +46,22 @@ class SparseGPDynamics(Learner[_Fitted]):
     anew at each training; hyperparameters from where the last training left them.
 
     Args:
-        observation_size: S.
-        action_size: A.
+        observation_size: numbers in an observation, S.
+        action_size: numbers in an action, A.
         observation_spec: how to read the observation.
-        kernel: with one lengthscale per input, shared by the outputs; a name in `gp.kernels.KERNELS`, such as "rbf".
-        num_inducing: M, inducing points; of fewer transitions, each is one.
+        kernel: covariance function, shared by the outputs, from the smoothest functions to the roughest: rbf, matern72,
+            matern52, matern32 or matern12.
+        num_inducing: inducing points, M; more of them follow finer detail and cost more time. While there are fewer
+            transitions than that, each of them is one.
         exact: make every transition an inducing point and keep it there, which is the exact Gaussian process up to the
-            jitter. Cost grows with the cube of the number of transitions: for small data.
-        max_training_iterations: of the optimiser, in each training.
+            jitter; for small data, since the cost grows with the cube of their number.
+        max_training_iterations: iterations of the optimiser, L-BFGS, in each training, at most.
         draw: how particles move: "DS", each by its own draw from the Gaussian at its place; "MM", as DS, then the
             particles of a candidate are replaced by draws from their mean and variance; "AMM", a Gaussian per
             candidate through its exact moments (kernel "rbf", more particles than an observation has numbers).
         add_noise: draw the observations' noise too; PETS draws the function alone.
         update_within_episode: condition on each new transition at once, hyperparameters and inducing inputs frozen (if
-            ``exact``, each is one more inducing input); PETS does so between episodes only.
+            exact, each is one more inducing input); PETS does so between episodes only.
         dtype: precision of a rollout's states; the model itself computes in float64.
         device: where tensors live.
 
@@ -94,8 +96,8 @@ class SparseGPDynamics(Learner[_Fitted]):
             raise ValueError(f"the draw AMM has closed forms for the kernel 'rbf' only, received {kernel!r}")
         if draw == "AMM" and observation_spec is not None and observation_spec.body_frame:
             raise ValueError(
-                "the draw AMM has closed forms for sines and cosines, not for vectors that turn with a heading: "
-                f"received body_frame={observation_spec.body_frame}; take the draw MM"
+                "the draw AMM has no closed forms for vectors that turn with a heading: use the draw MM, or leave out "
+                f"body_frame, received body_frame={observation_spec.body_frame}"
             )
         super().__init__(observation_size, action_size, observation_spec, dtype, device)
         self.num_inducing, self.exact = num_inducing, exact
@@ -120,7 +122,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         }
 
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
-        """Condition on the grown data if ``update_within_episode``; otherwise nothing.
+        """Condition on the grown data if ``update_within_episode``; otherwise do nothing.
 
         Raises:
             RuntimeError: the model was not fitted.
@@ -139,7 +141,7 @@ class SparseGPDynamics(Learner[_Fitted]):
 
         Raises:
             RuntimeError: the model was not fitted.
-            ValueError: too few particles for "AMM".
+            ValueError: there are too few particles for "AMM".
         """
         model, normalisers, posterior = self._require_fit("draw")
         noise = model.noise_variance if self.add_noise else torch.zeros_like(model.noise_variance)
@@ -177,15 +179,14 @@ class SparseGPDynamics(Learner[_Fitted]):
         received = state.get("inducing_inputs")
         count = len(received) if isinstance(received, Tensor) and received.ndim == 2 else self.num_inducing
         count = count if self.exact else min(count, self.num_inducing)
-        layer = take_layer(state, "", self.kernel, count, sizes[0], device)
+        layer = Layer(self.kernel, **take_tensors(state, parameter_shapes(count, sizes[0]), device))
         model = DeepGP((layer,), take_tensor(state, "log_noise", (sizes[1],), device))
         normalisers = (
             take_normaliser(state, "inputs", sizes[0], device),
             take_normaliser(state, "targets", sizes[1], device),
         )
-        matrices = ((count, count), (count,), (count, sizes[1]))
-        names = (f"posterior.{name}" for name in SparsePosterior._fields)
-        posterior = SparsePosterior(*(take_tensor(state, *pair, device) for pair in zip(names, matrices, strict=True)))
+        shapes = dict(zip(SparsePosterior._fields, ((count, count), (count,), (count, sizes[1])), strict=True))
+        posterior = SparsePosterior(**take_tensors(state, shapes, device, prefix="posterior."))
         self._fitted = _Fitted(model, normalisers, posterior)
 
     def _start(self, data: Data, normalisers: tuple[Normaliser, Normaliser], generator: torch.Generator) -> DeepGP:
@@ -197,7 +198,7 @@ class SparseGPDynamics(Learner[_Fitted]):
             layer = Layer(self.kernel, inducing, data.x.new_full((size,), 0.5 * math.log(size)), data.x.new_zeros(()))
             return DeepGP((layer,), data.y.new_full((data.y.shape[1],), math.log(NOISE_VARIANCE)))
         last = self._fitted
-        outputs = data.y.new_zeros(last.model.num_whitened())  # of the inducing outputs nothing is carried over
+        outputs = data.y.new_zeros(last.model.num_whitened())  # the inducing outputs are not carried over
         model, _ = restandardise(last.model, outputs, last.normalisers, normalisers)
         return model._replace(layers=(model.layers[0]._replace(inducing_inputs=inducing),))
 
@@ -207,7 +208,7 @@ class SparseGPDynamics(Learner[_Fitted]):
 
 
 def _predictor(model: DeepGP, posterior: SparsePosterior) -> Predictor:
-    """The same predictions, in the form of which the moments are known."""
+    """The same predictions, in the form whose moments are known."""
     layer, basis = model.layers[0], posterior.basis
     removed = shrinkage(posterior, model.noise_variance).mT.unsqueeze(-1)
     return Predictor(

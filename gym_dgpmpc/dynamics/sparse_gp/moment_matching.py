@@ -71,7 +71,7 @@ def encoded_moments(
 class MomentMatchingSampler:
     """Moves each candidate's Gaussian one step, and spreads the particles by it.
 
-    A candidate with a particle or an action that is not finite is NaN after the step, and no other feels it.
+    A candidate with a particle or an action that is not finite is NaN after the step, and affects no other.
 
     Args:
         predictor: the trained functions, from standardised inputs to standardised targets.
@@ -98,8 +98,8 @@ class MomentMatchingSampler:
         size = encoder.observation_size
         if num_particles <= size:
             raise ValueError(
-                f"the draw AMM stands for the Gaussian of {size} numbers by particles: it needs at least {size + 1} of "
-                f"them, received {num_particles}"
+                f"the draw AMM needs at least {size + 1} particles for an observation of {size} numbers, received "
+                f"{num_particles}"
             )
         self._predictor, self._encoder, self._inputs, self._targets = predictor, encoder, inputs, targets
         self._noise = noise_variance

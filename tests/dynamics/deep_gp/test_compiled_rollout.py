@@ -133,7 +133,7 @@ def test_a_kernel_that_the_compiled_code_does_not_have_is_left_to_pytorch(monkey
             warnings.simplefilter("always")
             worlds.append(model.draw(2, 3, seeded()))
         said = [str(warning.message) for warning in caught]
-        assert len(said) == (len(worlds) == 1) and all("no kernel 'own'" in text for text in said)
+        assert len(said) == (len(worlds) == 1) and all("kernel 'own'" in text for text in said)
         assert not isinstance(worlds[-1], TrajectorySampler)
     states = [world(observation.expand(2, -1, -1).clone(), observation[:, :2], 0) for world in worlds]
     assert all(torch.equal(states[0], other) for other in states[1:])
@@ -141,7 +141,7 @@ def test_a_kernel_that_the_compiled_code_does_not_have_is_left_to_pytorch(monkey
 
 def test_a_compiled_world_of_an_unknown_kernel_is_an_error(monkeypatch):
     monkeypatch.setitem(KERNELS, "own", Own())
-    with pytest.raises(RuntimeError, match="no kernel 'own'"):
+    with pytest.raises(RuntimeError, match="kernel 'own'"):
         Draw("own", 1)
 
 
@@ -218,9 +218,9 @@ def test_the_argument_may_be_a_view_of_another_precision():
 @pytest.mark.parametrize(
     ("observation_size", "action_size", "horizon", "message"),
     [
-        (2, 2, HORIZON, r"observation must have the shape \(3,\), got \(2,\)"),
-        (3, 1, HORIZON, rf"actions must have the shape \[K, H, 2\], got \(4, {HORIZON}, 1\)"),
-        (3, 2, HORIZON + 1, f"plans of at most {HORIZON} steps, got actions for {HORIZON + 1}"),
+        (2, 2, HORIZON, r"observation .*\(3,\).*\(2,\)"),
+        (3, 1, HORIZON, rf"actions .*\b2\].*\(4, {HORIZON}, 1\)"),
+        (3, 2, HORIZON + 1, rf"actions .*\b{HORIZON}\b.*\b{HORIZON + 1}\b"),
     ],
 )
 def test_sizes_that_are_not_the_draws_are_refused(observation_size, action_size, horizon, message):

@@ -2,6 +2,7 @@
 
 import functools
 import os
+import re
 import stat
 import subprocess
 import sys
@@ -33,8 +34,8 @@ def fresh(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("command", "complaint"),
     [
-        ("no-such-compiler", "no C\\+\\+ compiler was found \\(looked for no-such-compiler\\)"),
-        ("false", "false failed"),
+        ("no-such-compiler", "compiler.*no-such-compiler"),
+        ("false", r"\bfalse\b.*exit code 1"),
     ],
 )
 def test_without_a_compiler_one_warning_and_the_same_worlds(monkeypatch, command, complaint):
@@ -82,7 +83,7 @@ def test_is_built_once(tmp_path, monkeypatch):
 def test_a_cache_that_others_can_write_to_is_not_used(tmp_path):
     folder = compiler.cache_folder()
     folder.chmod(0o777)
-    with pytest.warns(UserWarning, match="can be written to by other users"):
+    with pytest.warns(UserWarning, match=re.escape(str(folder))):
         assert compiler.load("rollout") is None
     folder.chmod(0o700)
     assert stat.S_IMODE(compiler.cache_folder().stat().st_mode) == 0o700
@@ -134,5 +135,5 @@ def test_memory_that_cannot_be_had_is_an_error(monkeypatch):
     observation = normal(seeded(), 10, 3).float()
     model.fit(Transitions(observation, observation[:, :2], observation), seeded())
     world = model.draw(2, 3, seeded())
-    with pytest.raises(MemoryError, match="scratch space"):
+    with pytest.raises(MemoryError, match="rollout"):
         world.trajectories(observation[0], torch.zeros(4, 3, 2))

@@ -1,5 +1,7 @@
 """The dynamics model as the agent uses it: fit, resample, draw, save and load, at tiny sizes."""
 
+import re
+
 import pytest
 import torch
 
@@ -102,7 +104,7 @@ def test_no_transitions_are_an_error():
 
 @pytest.mark.parametrize("verb", ["draw", "resample"])
 def test_an_unfitted_model_says_so(verb):
-    with pytest.raises(RuntimeError, match=f"cannot {verb}: the dynamics model has not been fitted"):
+    with pytest.raises(RuntimeError, match=f"{verb}.*fit"):
         if verb == "draw":
             tiny().draw(1, 1, seeded())
         else:
@@ -185,23 +187,23 @@ def test_an_unfitted_model_saves_and_loads_too():
     model = fitted()
     assert tiny().state_dict() == {}
     model.load_state_dict({})
-    with pytest.raises(RuntimeError, match="not been fitted"):
+    with pytest.raises(RuntimeError, match=r"draw.*fit"):
         model.draw(1, 1, seeded())
 
 
 @pytest.mark.parametrize(
-    ("settings", "name"),
+    ("settings", "name", "expected", "received"),
     [
-        ({"num_inducing": 9}, "layers.0.inducing_inputs"),
-        ({"num_layers": 3}, "layers.2.inducing_inputs"),
-        ({"num_samples": 5}, "pool"),
+        ({"num_inducing": 9}, "layers.0.inducing_inputs", (9, 4), (8, 4)),
+        ({"num_layers": 3}, "layers.2.inducing_inputs", (8, 4), None),
+        ({"num_samples": 5}, "pool", (5, 48), (4, 48)),
     ],
 )
-def test_the_state_of_another_model_is_refused(settings, name):
+def test_the_state_of_another_model_is_refused(settings, name, expected, received):
     """And what was learned before stays."""
     model = fitted(**settings)
     before = predictions(model)
-    with pytest.raises(ValueError, match=rf"'{name}': expected a tensor of shape .* received"):
+    with pytest.raises(ValueError, match=rf"'{name}'.*{re.escape(str(expected))}.*{re.escape(str(received))}"):
         model.load_state_dict(fitted().state_dict())
     assert torch.equal(predictions(model), before)
 
@@ -219,32 +221,32 @@ def test_a_missing_or_damaged_entry_is_named(name, value):
 
 @pytest.mark.parametrize("oldest", [-1, 4])
 def test_a_position_outside_the_ring_is_refused(oldest):
-    with pytest.raises(ValueError, match=f"'oldest'.*received {oldest}"):
+    with pytest.raises(ValueError, match=rf"'oldest'.*\b3\b.* {oldest}$"):
         tiny().load_state_dict(fitted().state_dict() | {"oldest": oldest})
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"num_layers": 0}, "num_layers must be at least 1, got 0"),
-        ({"num_inducing": 0}, "num_inducing must be at least 1"),
-        ({"num_features": -1}, "num_features must be at least 1, got -1"),
-        ({"first_training_iterations": 0}, "first_training_iterations must be at least 1, got 0"),
-        ({"training_iterations": 0}, "training_iterations must be at least 1, got 0"),
-        ({"num_samples": 0}, "num_samples"),
-        ({"sample_spacing": 0}, "sample_spacing"),
-        ({"resample_samples": 0}, "resample_samples must be at least 1, got 0"),
-        ({"resample_samples": -3}, "resample_samples must be at least 1, got -3"),
-        ({"resample_steps": -1}, "resample_steps must be at least 0, received -1"),
-        ({"batch_size": 0}, "batch_size must be at least 1, got 0"),
-        ({"patience": 0}, "patience must be at least 1, got 0"),
-        ({"step_size": 0.0}, "step_size must be positive and finite, received 0.0"),
-        ({"learning_rate": float("nan")}, "learning_rate must be positive and finite, received nan"),
-        ({"decay": 1.5}, r"decay must lie in \[0, 1\], received 1.5"),
-        ({"gibbs_every": -1}, "gibbs_every must be at least 0, received -1"),
-        ({"draw": "thompson"}, "unknown draw 'thompson': expected one of pathwise, joint, marginal"),
-        ({"refresh": "never"}, "unknown refresh 'never': expected one of step, plan"),
-        ({"kernel": "cubic"}, "unknown kernel 'cubic': expected one of rbf"),
+        ({"num_layers": 0}, "num_layers .* 0$"),
+        ({"num_inducing": 0}, "num_inducing .* 0$"),
+        ({"num_features": -1}, "num_features .* -1$"),
+        ({"first_training_iterations": 0}, "first_training_iterations .* 0$"),
+        ({"training_iterations": 0}, "training_iterations .* 0$"),
+        ({"num_samples": 0}, "num_samples .* 0$"),
+        ({"sample_spacing": 0}, "sample_spacing .* 0$"),
+        ({"resample_samples": 0}, "resample_samples .* 0$"),
+        ({"resample_samples": -3}, "resample_samples .* -3$"),
+        ({"resample_steps": -1}, "resample_steps .* -1$"),
+        ({"batch_size": 0}, "batch_size .* 0$"),
+        ({"patience": 0}, "patience .* 0$"),
+        ({"step_size": 0.0}, r"step_size .* 0\.0$"),
+        ({"learning_rate": float("nan")}, "learning_rate .* nan$"),
+        ({"decay": 1.5}, r"decay .* 1\.5$"),
+        ({"gibbs_every": -1}, "gibbs_every .* -1$"),
+        ({"draw": "thompson"}, "draw 'thompson'.*pathwise, joint, marginal"),
+        ({"refresh": "never"}, "refresh 'never'.*step, plan"),
+        ({"kernel": "cubic"}, "kernel 'cubic'.*rbf"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -308,7 +310,7 @@ def test_a_state_without_a_step_size_has_the_one_asked_for():
     model.load_state_dict(state)
     assert model._fitted.step_size == 0.01
     for value in (0.0, float("nan"), "text"):
-        with pytest.raises(ValueError, match="'step_size': expected a positive number, received"):
+        with pytest.raises(ValueError, match=rf"'step_size'.* {value!r}$"):
             model.load_state_dict(state | {"step_size": value})
 
 

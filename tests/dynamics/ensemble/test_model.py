@@ -1,6 +1,7 @@
 """The ensemble against plain numpy, its training against a second implementation, its draws at known networks."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -189,7 +190,7 @@ def test_ds_draws_from_the_mixtures_mean_and_total_variance():
 @pytest.mark.parametrize("draw", ["TS1", "TSinf"])
 @pytest.mark.parametrize("num_particles", [1, 4, 0])
 def test_particles_that_cannot_be_shared_out_are_an_error(draw, num_particles):
-    with pytest.raises(ValueError, match=rf"{draw} needs a multiple of the ensemble's 3 .* received {num_particles}"):
+    with pytest.raises(ValueError, match=rf"{draw} .*particles .*\b3\b.* {num_particles}$"):
         constant(draw).draw(num_particles, 1, seeded())
 
 
@@ -224,25 +225,22 @@ def test_half_precision_is_for_planning_alone():
 def test_a_damaged_count_is_named(num_updates):
     model = small()
     model.fit(pendulum.simulate(5), seeded())
-    with pytest.raises(ValueError, match=r"'adam.num_updates': expected a positive integer, received"):
+    with pytest.raises(ValueError, match=rf"'adam\.num_updates'.* {re.escape(repr(num_updates))}$"):
         model.load_state_dict(model.state_dict() | {"adam.num_updates": num_updates})
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"num_members": 0}, "num_members must be at least 1, got 0"),
-        ({"num_hidden_layers": 0}, "num_hidden_layers must be at least 1"),
-        ({"hidden_size": 0}, "hidden_size"),
-        ({"batch_size": 0}, "batch_size"),
-        ({"num_epochs": 0}, "num_epochs"),
-        (
-            {"weight_decay": (1e-3, 1e-3)},
-            r"each of the 2 hidden layers and one for the last, received \(0.001, 0.001\)",
-        ),
-        ({"weight_decay": (1e-3, 1e-3, -1.0)}, "not negative"),
-        ({"learning_rate": 0.0}, "learning_rate must be positive, received 0.0"),
-        ({"draw": "TS2"}, "unknown draw 'TS2': expected one of TS1, TSinf, DS, MM, expectation"),
+        ({"num_members": 0}, "num_members .* 0$"),
+        ({"num_hidden_layers": 0}, "num_hidden_layers .* 0$"),
+        ({"hidden_size": 0}, "hidden_size .* 0$"),
+        ({"batch_size": 0}, "batch_size .* 0$"),
+        ({"num_epochs": 0}, "num_epochs .* 0$"),
+        ({"weight_decay": (1e-3, 1e-3)}, r"weight_decay .*\b2\b.*\(0\.001, 0\.001\)$"),
+        ({"weight_decay": (1e-3, 1e-3, -1.0)}, r"weight_decay .*-1\.0\)$"),
+        ({"learning_rate": 0.0}, r"learning_rate .* 0\.0$"),
+        ({"draw": "TS2"}, "draw 'TS2'.*TS1, TSinf, DS, MM, expectation"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")

@@ -148,14 +148,14 @@ def test_later_trainings_start_from_the_last_one():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"num_inducing": 0}, "num_inducing must be at least 1, got 0"),
-        ({"max_training_iterations": 0}, "max_training_iterations must be at least 1, got 0"),
-        ({"draw": "TS1"}, "unknown draw 'TS1': expected one of DS, MM, AMM"),
-        ({"kernel": "cubic"}, "unknown kernel 'cubic'"),
-        ({"kernel": "matern32", "draw": "AMM"}, "AMM has closed forms for the kernel 'rbf' only, received 'matern32'"),
+        ({"num_inducing": 0}, "num_inducing .* 0$"),
+        ({"max_training_iterations": 0}, "max_training_iterations .* 0$"),
+        ({"draw": "TS1"}, "draw 'TS1'.*DS, MM, AMM"),
+        ({"kernel": "cubic"}, "kernel 'cubic'"),
+        ({"kernel": "matern32", "draw": "AMM"}, "AMM .*'rbf'.*'matern32'"),
         (
             {"observation_spec": ObservationSpec(body_frame=((0, 1, 2),)), "draw": "AMM"},
-            r"AMM has closed forms .* received body_frame=\(\(0, 1, 2\),\); take the draw MM",
+            r"AMM .*body_frame=\(\(0, 1, 2\),\)",
         ),
     ],
 )
@@ -166,7 +166,5 @@ def test_settings_out_of_range_are_named(settings, message):
 
 
 def test_the_state_of_a_larger_model_is_refused():
-    with pytest.raises(
-        ValueError, match=r"'inducing_inputs': expected a tensor of shape \(10, 4\), received \(20, 4\)"
-    ):
+    with pytest.raises(ValueError, match=r"'inducing_inputs'.*\(10, 4\).*\(20, 4\)"):
         SparseGPDynamics(2, 1, pendulum.SPEC, num_inducing=10).load_state_dict(fitted().state_dict())

@@ -365,7 +365,7 @@ extern "C" {
 int64_t units() { return UNITS; }
 int64_t points() { return POINTS; }
 
-// By which number a Layer names this kernel; -1 if there is none of that name.
+// The number by which a Layer names this kernel; -1 if it is not here.
 int64_t kernel_number(const char *name) {
   for (int64_t i = 0; i < KERNELS::size; i++)
     if (!strcmp(KERNELS::entries[i].name, name)) return i;

@@ -1,4 +1,4 @@
-"""A run keeps its results as they come, and goes on where its last finished episode ended."""
+"""A training run keeps its results as they come, and goes on where its last finished episode ended."""
 
 import json
 from functools import partial
@@ -9,7 +9,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from gym_dgpmpc.agents import DGPMPCAgent
 from gym_dgpmpc.errors import PlanningError
-from gym_dgpmpc.runs.run import EpisodeRow, RunFolder, RunFolderError, TrainingRun, read_rows
+from gym_dgpmpc.runs.folder import RunFolder
+from gym_dgpmpc.runs.training import TrainingRun
 from tests.runs.toy import EPISODE_STEPS, SMALLEST_AGENT
 
 HOLDERS = []
@@ -160,43 +161,6 @@ def test_what_was_finished_survives_a_failure(tmp_path, monkeypatch):
         run.train(progress_bar=False)
     assert len(run.folder.rows()) == 2
     assert len(DGPMPCAgent.load(run.folder.agent_file).store) == 24
-
-
-def test_refuses_another_runs_folder(tmp_path):
-    training_run(tmp_path, num_episodes=1).train(progress_bar=False)
-    HOLDERS[0].close()
-    with pytest.raises(RunFolderError, match=r"other settings .seed was 0, now 1.*--overwrite"):
-        RunFolder(tmp_path, SETTINGS | {"seed": 1})
-    (tmp_path / "settings.json").write_text("[]")
-    with pytest.raises(RunFolderError, match="without readable settings"):
-        RunFolder(tmp_path, SETTINGS)
-
-
-def test_overwrites_only_when_asked(tmp_path):
-    run = training_run(tmp_path, num_episodes=1)
-    run.train(progress_bar=False)
-    run.write_figures("")
-    (tmp_path / "notes.txt").write_text("mine")
-    HOLDERS[0].close()
-    folder = RunFolder(tmp_path, {"seed": 1}, overwrite=True)
-    assert not folder.goes_on
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", ".lock-holder.json", "notes.txt"]
-
-
-@pytest.mark.parametrize("success", [True, False, None])
-def test_what_is_written_of_an_episode_is_read_again(tmp_path, success):
-    rows = [EpisodeRow(1, "planned", -0.125, 12, 12, 2.5, 1.25, success)]
-    folder = RunFolder(tmp_path, SETTINGS)
-    folder.write_rows(rows)
-    folder.close()
-    assert read_rows(tmp_path / "episodes.csv") == rows
-
-
-def test_episodes_of_an_older_version_are_read(tmp_path):
-    path = tmp_path / "episodes.csv"
-    assert read_rows(path) == []
-    path.write_text("episode,actions,episode_return,steps,total_steps,seconds\n1,random,-0.5,12,12,0.25\n")
-    assert read_rows(path) == [EpisodeRow(1, "random", -0.5, 12, 12, 0.25, 0.0, None)]
 
 
 def test_for_results_only_nothing_is_drawn_or_said(tmp_path, capsys):

@@ -1,0 +1,165 @@
+"""The folder of a training run: what it was asked to do, its results as they come, and its agent.
+
+It holds `settings.json` (what was asked, with which versions), `episodes.csv` (raw results), `agent.zip` (and
+`agent.previous.zip`, the one before), `tensorboard/`, and when the run ends `learning_curve.png`, `prediction_fan.png`
+and `last_episode.gif`. `training.py` fills it; the benchmarks read the same files.
+"""
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from gym_dgpmpc.checkpoints.files import replace_text
+from gym_dgpmpc.checkpoints.folder import RunCheckpoints
+from gym_dgpmpc.errors import DGPMPCError
+from gym_dgpmpc.runs.provenance import machine, revision, versions
+
+SETTINGS_FILE, EPISODES_FILE, LOGS = "settings.json", "episodes.csv", "tensorboard"
+FIGURES = LEARNING_CURVE, PREDICTION_FAN, LAST_EPISODE = "learning_curve.png", "prediction_fan.png", "last_episode.gif"
+
+
+class RunFolderError(DGPMPCError, ValueError):
+    """A folder holds another run than the one that was asked for."""
+
+
+class EpisodeRow(NamedTuple):
+    """One line of `episodes.csv`."""
+
+    episode: int
+    """Counts from 1, the random ones included."""
+    actions: str
+    """"random" if its first actions were, else "planned"."""
+    episode_return: float
+    steps: int
+    total_steps: int
+    """Environment steps of the run up to the episode's end."""
+    seconds: float
+    """Wall-clock time that it took, with the training before it."""
+    planning_seconds: float = 0.0
+    """The part of that time in which plans were made."""
+    success: bool | None = None
+    """Whether the goal was reached in the last step, for tasks that say so in ``info["is_success"]``."""
+
+    @classmethod
+    def from_text(cls, row: dict[str, str]) -> "EpisodeRow":
+        """A row as `csv.DictReader` reads it; older versions lack the last columns."""
+        success = row.get("success") or None
+        return cls(
+            int(row["episode"]),
+            row["actions"],
+            float(row["episode_return"]),
+            int(row["steps"]),
+            int(row["total_steps"]),
+            float(row["seconds"]),
+            float(row.get("planning_seconds", 0.0)),
+            None if success is None else success == str(True),
+        )
+
+
+def read_rows(path: Path) -> list[EpisodeRow]:
+    """All episodes in an `episodes.csv`; an empty list if the file does not exist."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [EpisodeRow.from_text(row) for row in csv.DictReader(file)]
+
+
+class RunFolder:
+    """The files of one run, held by this process until `close`.
+
+    Args:
+        path: the folder; made if it does not exist.
+        settings: what identifies the run. A folder that holds a run with others is refused.
+        defaults: the values of settings in runs that are older than these settings.
+        overwrite: delete the run that the folder holds, and begin anew.
+        otherwise: what the error about another run's folder advises.
+
+    Raises:
+        RunFolderError: the folder holds a run with other settings.
+        RunInUseError: another process holds it.
+        CheckpointWriteError: it cannot be written to. It is an OSError too.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        settings: dict[str, Any],
+        *,
+        defaults: Mapping[str, Any] = MappingProxyType({}),
+        overwrite: bool = False,
+        otherwise: str = "choose another folder with --out, or --overwrite to begin anew",
+    ):
+        self.path, self.settings = path, json.loads(json.dumps(settings))
+        self._defaults = json.loads(json.dumps(dict(defaults)))
+        self._advice = otherwise
+        self.checkpoints = RunCheckpoints(path)
+        self.agent_file, self.episodes_file = self.checkpoints.newest, path / EPISODES_FILE
+        try:
+            if overwrite:
+                self.checkpoints.delete()
+                for name in (SETTINGS_FILE, EPISODES_FILE, *FIGURES):
+                    (path / name).unlink(missing_ok=True)
+                shutil.rmtree(path / LOGS, ignore_errors=True)
+            self.goes_on = self.checkpoints.exist
+            if self.goes_on:
+                self._refuse_other_settings()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let another process have the folder."""
+        self.checkpoints.close()
+
+    def write_settings(self, **facts: Any) -> None:
+        """Write settings, versions and machine; ``facts`` are recorded but do not identify the run.
+
+        A run that goes on keeps the time at which it started.
+        """
+        now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+        content = {
+            "settings": self.settings,
+            **facts,
+            "started": self.read_settings().get("started", now) if self.goes_on else now,
+            "revision": revision(),
+            "versions": versions(),
+            "machine": machine(),
+        }
+        replace_text(self.path / SETTINGS_FILE, json.dumps(content, indent=2) + "\n")
+
+    def read_settings(self) -> dict[str, Any]:
+        """What `write_settings` wrote the last time."""
+        return json.loads((self.path / SETTINGS_FILE).read_text())
+
+    def rows(self) -> list[EpisodeRow]:
+        """All episodes so far."""
+        return read_rows(self.episodes_file)
+
+    def write_rows(self, rows: list[EpisodeRow]) -> None:
+        """Replace all rows, the column names included; a kill leaves the old rows or the new ones."""
+        text = io.StringIO(newline="")
+        csv.writer(text).writerows([EpisodeRow._fields, *rows])
+        replace_text(self.episodes_file, text.getvalue())
+
+    def _refuse_other_settings(self) -> None:
+        try:
+            before = {**self._defaults, **self.read_settings()["settings"]}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise RunFolderError(
+                f"{self.path} holds an agent, but {SETTINGS_FILE} cannot be read ({error}): {self._advice}"
+            ) from error
+        differing = [
+            f"{name} was {before.get(name)}, now {self.settings.get(name)}"
+            for name in sorted({*before, *self.settings})
+            if before.get(name) != self.settings.get(name)
+        ]
+        if differing:
+            raise RunFolderError(
+                f"{self.path} holds a run with other settings ({'; '.join(differing)}): {self._advice}"
+            )
