@@ -77,3 +77,14 @@ def test_the_comparison_gives_all_methods_the_same_plans(env_id):
     assert presets.COMPARISON_GP[env_id] == paper
     networks = pets.keys() - set(PLANNING)
     assert networks and all(pets[name] == presets.PETS[env_id][name] for name in networks)
+
+
+@pytest.mark.parametrize(
+    ("task", "planned"),
+    [("ModCartPole-v0", (30, 5, 1)), ("BiasedReacher-v0", (20, 5, 1)), ("RiskSensitiveHalfCheetah-v0", (40, 10, 2))],
+)
+def test_the_papers_plans_are_those_of_its_table(task, planned):
+    """Gadd et al. (2020), supplement: horizon, iterations and actions per plan; 300 sequences, 5 particles, M = 200."""
+    settings = presets.PAPER[task]
+    assert (settings["horizon"], settings["num_iterations"], settings["actions_per_plan"]) == planned
+    assert (settings["num_candidates"], settings["num_particles"], settings["num_inducing"]) == (300, 5, 200)

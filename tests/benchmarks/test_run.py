@@ -92,7 +92,7 @@ def test_a_run_goes_on_within_a_long_episode(folders, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run.perform(folders)
     plan, planned = CEM.plan, []
-    monkeypatch.setattr(CEM, "plan", lambda *arguments: planned.append(1) or plan(*arguments))
+    monkeypatch.setattr(CEM, "plan", lambda *given, **named: planned.append(1) or plan(*given, **named))
     run.perform(folders)
     assert len(planned) == 4 * EPISODE_STEPS - 28
     result = RunResult.read(folders.results / run.file_name)
