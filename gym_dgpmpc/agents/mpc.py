@@ -44,7 +44,7 @@ from gym_dgpmpc.checkpoints.format import CheckpointPath, write_checkpoint
 from gym_dgpmpc.checkpoints.interface import StateOf
 from gym_dgpmpc.checkpoints.restore import load_agent
 from gym_dgpmpc.checkpoints.safeguard import Guard, safeguard
-from gym_dgpmpc.checks import check_counts
+from gym_dgpmpc.checks import check_counts, saved_count
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError, ReliabilityWarning
 from gym_dgpmpc.planning.controller import Controller
@@ -75,9 +75,6 @@ SelfAgent = TypeVar("SelfAgent", bound="MPCAgent")
 
 ENDLESS = 1000
 """Random steps after which a warning says that no episode has ended. Gymnasium's own tasks have at most as many."""
-
-LARGEST_COUNT = 1 << 53
-"""What a file may claim of a counter."""
 
 
 class MPCAgent(BaseAlgorithm):
@@ -184,8 +181,8 @@ class MPCAgent(BaseAlgorithm):
         policy, env, dynamics, planner = called_in_order(type(self).__name__, args, policy, env, dynamics, planner)
         optional = {"learning_starts": learning_starts, "train_freq": train_freq}
         check_counts(**{name: count for name, count in optional.items() if count is not None})
-        self._planner_given = "cem" if planner is None else planner
-        self.settings = self._complete(settings, self._planner_given, dynamics)
+        self.planner_given = "cem" if planner is None else planner
+        self.settings = self._complete(settings, self.planner_given, dynamics)
         if env is not None:
             env = wrapped_env(env)
         super().__init__(
@@ -250,9 +247,9 @@ class MPCAgent(BaseAlgorithm):
         self.store = TransitionStore(flat_size(self.observation_space), flat_size(self.action_space))
         self.generators: Generators = split_seed(self.seed, self.device)
         self.task = Task(self.env, self.observation_space, self.action_space, self._task_given, self.device)
-        of_planner = set(self.part_settings(self._planner_given)) - set(self._model_settings())
+        of_planner = set(self.part_settings(self.planner_given)) - set(self._model_settings())
         planner = make_planner(
-            self._planner_given, self.action_space, self.device, **{name: self.settings[name] for name in of_planner}
+            self.planner_given, self.action_space, self.device, **{name: self.settings[name] for name in of_planner}
         )
         self.num_fitted = 0  # transitions that the last training saw
         self.controller = Controller(
@@ -870,12 +867,12 @@ class MPCAgent(BaseAlgorithm):
     @property
     def planner_name(self) -> str | None:
         """The registered name that the planner was given by; None if it was given as a class or an object."""
-        return self._planner_given if isinstance(self._planner_given, str) else None
+        return self.planner_given if isinstance(self.planner_given, str) else None
 
     def arguments(self) -> dict[str, Any]:
         """The constructor arguments as they are now, those that a file holds."""
         own = {name: getattr(self, name) for name in self.own_settings()}
-        saved = self.saved_settings(self._planner_given)
+        saved = self.saved_settings(self.planner_given)
         return {"planner": self.planner_name} | {name: {**self.settings, **own}[name] for name in saved}
 
     def nouns(self) -> dict[str, Stateful]:
@@ -906,14 +903,18 @@ class MPCAgent(BaseAlgorithm):
         return state
 
     def _load_progress(self, state: StateDict) -> None:
-        counts = {name: state[name] for name in ("num_timesteps", "num_fitted", "num_episodes")}
-        for name, count in counts.items():
-            if not isinstance(count, int) or isinstance(count, bool) or not 0 <= count <= LARGEST_COUNT:
-                raise ValueError(f"{name} must be a count from 0 to {LARGEST_COUNT}, got {count!r}")
-        self.num_timesteps, self.num_fitted, self._episode_num = counts.values()
+        self.num_timesteps, self.num_fitted, self._episode_num = (
+            saved_count(name, state[name]) for name in ("num_timesteps", "num_fitted", "num_episodes")
+        )
         self._last_obs = None
-        if "last_observation" in state and len(state["last_observation"]) == self.n_envs:
-            self.begin_at(state["last_observation"].numpy(), state["last_episode_starts"].numpy())
+        if "last_observation" not in state:
+            return
+        observation, starts = state["last_observation"].numpy(), state["last_episode_starts"].numpy()
+        num_envs = len(observation)
+        if observation.shape != (num_envs, flat_size(self.observation_space)) or starts.shape != (num_envs,):
+            raise ValueError(f"the last observation has the shape {observation.shape}, starts {starts.shape}")
+        if num_envs == self.n_envs:
+            self.begin_at(observation, starts)
 
     def begin_at(self, observation: np.ndarray | None, episode_starts: np.ndarray | None = None) -> None:
         """Let `learn` go on from these observations [n, S]; None lets it begin new episodes."""
