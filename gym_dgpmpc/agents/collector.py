@@ -200,6 +200,8 @@ class Collector:
             KeyError, TypeError, ValueError: the state is not one of running episodes.
         """
         num_envs = len(state[AGE])
+        if f"{num_envs}.index" in state:
+            raise ValueError(f"there are more running episodes than plans, of which there are {num_envs}")
         has_explored = [bool(state[f"{i}.has_explored"]) for i in range(num_envs)]
         if num_envs != len(self.running):
             self.running = self._new_episodes(len(self.running), has_explored=all(has_explored))

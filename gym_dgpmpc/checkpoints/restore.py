@@ -50,14 +50,14 @@ def load_agent(
     """
     checkpoint = read_checkpoint(path)
     agent_class = class_of(checkpoint, asked)
-    arguments = arguments_to_load(checkpoint, agent_class, replaced)
+    arguments, num_envs = arguments_to_load(checkpoint, agent_class, replaced), saved_num_envs(checkpoint)
     if env is not None:
         env = wrapped_env(env)
         _refuse_another_environment(env, checkpoint)
     try:
         agent = agent_class(env=env, device=device, _init_setup_model=False, **arguments)
         agent.observation_space, agent.action_space = saved_spaces(checkpoint)
-        agent.n_envs = saved_num_envs(checkpoint) if env is None else env.num_envs
+        agent.n_envs = num_envs if env is None else env.num_envs
         agent._setup_model()
     except DGPMPCError:
         raise
