@@ -1,4 +1,4 @@
-"""What the tests of checkpoints have in common: loading an agent of the point mass, and files taken apart and changed."""
+"""What the tests of checkpoints have in common: loading an agent of the point mass, and changing its file."""
 
 import zipfile
 
