@@ -30,7 +30,6 @@ AGENT_CLASSES = {
 MOST_STATES = 10**8
 """Nor may a file's arguments say that a plan holds more than that many states, H K P, at once."""
 
-
 NOT_PLAIN = frozenset({"policy", "env", "dynamics", "reward_fn", "terminated_fn", "device"})
 """Arguments of every agent that no file holds."""
 
@@ -63,8 +62,10 @@ def arguments_to_load(checkpoint: Checkpoint, agent: HasSettings, replaced: Mapp
     Raises:
         CheckpointError: see `saved_arguments`; or the file does not name its planner, and none is given.
     """
-    arguments = saved_arguments(checkpoint, agent, replaced.get("planner"))
-    planner = replaced.get("planner", arguments["planner"])
+    planner = replaced.get("planner")
+    arguments = saved_arguments(checkpoint, agent, planner)
+    if planner is None:
+        planner = arguments["planner"]
     if planner is None:
         raise CheckpointError(
             "the file's agent was given its planner as an object or a class, which no file holds: pass planner=... to "
@@ -72,7 +73,7 @@ def arguments_to_load(checkpoint: Checkpoint, agent: HasSettings, replaced: Mapp
         )
     takes = {"planner", *agent.saved_settings(planner)}
     kept = {name: value for name, value in arguments.items() if name in takes}
-    return kept | _asked_to_learn(checkpoint) | dict(replaced)
+    return kept | _asked_to_learn(checkpoint) | dict(replaced) | {"planner": planner}
 
 
 def saved_arguments(
@@ -83,7 +84,7 @@ def saved_arguments(
     Args:
         checkpoint: the file's contents.
         agent: whose arguments they are, or its class.
-        planner: the agent's, whose settings the file may hold although it does not name its planner.
+        planner: the agent's, if there is one, for a file that names none or one that is not registered here.
 
     Returns:
         Arguments by name, "planner" and "seed" always among them.
@@ -95,15 +96,16 @@ def saved_arguments(
     if not isinstance(received, dict):
         raise CheckpointError(f"the file's arguments must be an object, got {received!r}")
     name = received.get("planner")
-    if name is not None and not (isinstance(name, str) and name in PLANNERS):
+    registered = name if isinstance(name, str) and name in PLANNERS else None
+    if name != registered and (planner is None or not isinstance(name, str)):
         raise CheckpointError(
             f"the file's planner is {name!r}, and registered are {sorted(PLANNERS)}: register it with "
             "gym_dgpmpc.planning.register_planner before loading, or pass planner=... to load"
         )
-    # Where neither says which planner it was, its settings are those of the default.
-    known = agent.saved_settings(name or planner or "cem")
+    # Where nothing says which planner it was, its settings are those of the default.
+    known = agent.saved_settings(registered or ("cem" if planner is None else planner))
     unknown = set(received) - set(known) - {"planner"}
-    if name is None and planner is not None:
+    if registered is None and planner is not None:
         unknown &= NOT_PLAIN  # the others are settings of the planner that the agent had
     if unknown:
         raise CheckpointError(

@@ -91,7 +91,6 @@ def test_classes_are_checked(saved, tmp_path):
         (lambda c, t: c["arguments"].update(verbose={"a": 1}), "{'a': 1}"),
         (lambda c, t: c["arguments"].update(observation_spec={"observation_spec": {"angles": 3}}), "3"),
         (lambda c, t: c["arguments"].update(tensorboard_log=3), "tensorboard_log = 3"),
-        (lambda c, t: c["arguments"].update(planner="no-such"), "'no-such'"),
         (lambda c, t: c["arguments"].update(planner=["cem"]), r"\['cem'\]"),
         (lambda c, t: c["arguments"].update(planner={}), "{}"),
         (lambda c, t: c["arguments"].update(planner=True), "True"),
@@ -118,6 +117,8 @@ def saved_toy(tmp_path_factory):
     ("change", "message"),
     [
         (lambda c, t: c["arguments"].update(no_such=1), "'no_such'"),
+        (lambda c, t: c["arguments"].update(planner="no-such"), "'no-such'"),
+        (lambda c, t: c["arguments"].update(planner=None), "planner="),
         (lambda c, t: c["arguments"].update(num_layers=10**3), "num_layers = 1000"),
         (lambda c, t: c["arguments"].update(horizon=10**5), "horizon = 100000"),
         (lambda c, t: c["arguments"].update(num_candidates=10**5, num_particles=10**3), "300000000"),
@@ -223,6 +224,20 @@ def test_a_planner_that_was_given_as_a_class_is_given_again(tmp_path):
     other = DGPMPCAgent("ToyPush-v0", planner=Shooting, seed=0, actions_per_plan=2, **{**settings, "horizon": 4})
     with pytest.raises(CheckpointError, match="horizon was 3, now 4"):
         other.learn(EPISODE_STEPS + 5, run_folder=tmp_path, resume=True)
+
+
+def test_a_planner_that_is_no_longer_registered_can_be_given(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setitem(registry.PLANNERS, "policy-search", PolicySearch)
+        settings = {
+            name: each for name, each in SMALLEST_AGENT.items() if name not in ("num_candidates", "num_iterations")
+        }
+        DGPMPCAgent("ToyPush-v0", planner="policy-search", width=2, seed=0, **settings).save(tmp_path / "agent")
+    with pytest.raises(CheckpointError, match="'policy-search'"):
+        DGPMPCAgent.load(tmp_path / "agent")
+    assert DGPMPCAgent.load(tmp_path / "agent", planner=PolicySearch).settings["width"] == 2
+    other = DGPMPCAgent.load(tmp_path / "agent", planner="cem", num_candidates=9)
+    assert (other.settings["horizon"], other.settings["num_candidates"], "width" in other.settings) == (3, 9, False)
 
 
 def test_the_run_of_another_planner_is_refused(registered, tmp_path):

@@ -483,7 +483,7 @@ def test_outside_the_main_thread_there_are_no_signals_to_handle(tmp_path):
 
 
 def test_a_run_killed_before_it_has_logged_goes_on_in_the_folder_that_it_had_chosen(whole, tmp_path, monkeypatch):
-    def killed(*_):
+    def killed(*_, **__):
         raise KeyboardInterrupt
 
     (tmp_path / "logs" / "Other_7").mkdir(parents=True)
