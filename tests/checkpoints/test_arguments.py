@@ -182,7 +182,7 @@ def is_cold(agent):
 
 def test_a_planner_of_a_name_goes_on_with_its_plan(saved_toy):
     loaded = DGPMPCAgent.load(saved_toy)
-    assert loaded.planner_name == "cem"
+    assert loaded.planner_given == "cem"
     assert not is_cold(loaded)
 
 
@@ -192,7 +192,7 @@ def test_a_plan_without_a_sequence_of_actions_is_kept_too(registered, tmp_path):
     learned = DGPMPCAgent("ToyPush-v0", planner="policy-search", seed=0, **settings).learn(EPISODE_STEPS + 3)
     learned.save(tmp_path / "agent")
     loaded = DGPMPCAgent.load(tmp_path / "agent")
-    assert loaded.planner_name == "policy-search"
+    assert loaded.planner_given == "policy-search"
     (one,), (other,) = learned.collector.running, loaded.collector.running
     assert torch.equal(one.carried.plan.weight, other.carried.plan.weight)
     assert is_cold(DGPMPCAgent.load(tmp_path / "agent.zip", width=2))
