@@ -4,6 +4,9 @@ import difflib
 import numbers
 from collections.abc import Iterable
 
+LARGEST_COUNT = 1 << 53
+"""What a file may claim of something that is counted."""
+
 
 def check_counts(**counts: object) -> None:
     """Refuse settings that count something and are not a whole number, or are less than one.
@@ -16,6 +19,17 @@ def check_counts(**counts: object) -> None:
             raise TypeError(f"{name} must be a whole number, got {value!r}")
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
+
+
+def saved_count(name: str, value: object, lowest: int = 0) -> int:
+    """A whole number of a file, if it is one.
+
+    Raises:
+        ValueError: it is none, or does not lie in ``lowest`` to `LARGEST_COUNT`.
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or not lowest <= value <= LARGEST_COUNT:
+        raise ValueError(f"{name} must be a whole number from {lowest} to {LARGEST_COUNT}, got {value!r}")
+    return value
 
 
 def closest(name: str, known: Iterable[str]) -> str:

@@ -3,6 +3,7 @@
 `mpc.py` says what to do in each step; here it is done and stored.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,17 +15,15 @@ from numpy import ndarray
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from gym_dgpmpc.agents.episode import EpisodeRecord
+from gym_dgpmpc.checks import saved_count
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 from gym_dgpmpc.planning.controller import Controller
-from gym_dgpmpc.planning.plan_state import PlanState, plans_from_tensors, plans_to_tensors
+from gym_dgpmpc.planning.plan_state import AGE, PlanState, plans_from_tensors, plans_to_tensors
 from gym_dgpmpc.tasks.dict_observations import flatten
 from gym_dgpmpc.tasks.logged import LoggedRows
 from gym_dgpmpc.tasks.replay import episode_start
 from gym_dgpmpc.types import StateDict
-
-MOST_ENVIRONMENTS, LARGEST_COUNT = 10_000, 1 << 53
-"""What a file may claim."""
 
 
 @dataclass
@@ -175,12 +174,22 @@ class Collector:
             self.running[0].has_explored = True
 
     def state_dict(self) -> StateDict:
-        """Plans, records and numbers of the running episodes."""
-        state: StateDict = {"num_envs": len(self.running), **plans_to_tensors([each.carried for each in self.running])}
+        """Plans, and whose they are, records and numbers of the running episodes."""
+        plans = plans_to_tensors([each.carried for each in self.running])
+        state: StateDict = {"planner": self._planner_described(), **plans}
         for i, running in enumerate(self.running):
             state |= {f"{i}.index": running.index, f"{i}.has_explored": running.has_explored}
+            state[f"{i}.number"] = running.record.number
             state |= {f"{i}.record.{name}": value for name, value in running.record.state_dict().items()}
         return state
+
+    def _planner_described(self) -> dict[str, Any]:
+        """By which another planner's plans are known, or those that look ahead otherwise, as plain values."""
+        fields = self._controller.cold.plan._asdict()
+        return {
+            "class": type(self._controller.planner).__name__,
+            "fields": {name: list(value.shape) for name, value in fields.items()},
+        }
 
     def load_state_dict(self, state: StateDict) -> None:
         """Go on with the saved episodes; those of another number of environments are given up.
@@ -190,42 +199,31 @@ class Collector:
         Raises:
             KeyError, TypeError, ValueError: the state is not one of running episodes.
         """
-        num_envs = saved_num_envs(state)
+        num_envs = len(state[AGE])
+        if f"{num_envs}.index" in state:
+            raise ValueError(f"there are more running episodes than plans, of which there are {num_envs}")
         has_explored = [bool(state[f"{i}.has_explored"]) for i in range(num_envs)]
         if num_envs != len(self.running):
             self.running = self._new_episodes(len(self.running), has_explored=all(has_explored))
             return
-        plans = self._saved_plans(state)
-        for i, (running, plan) in enumerate(zip(self.running, plans, strict=True)):
-            index = state[f"{i}.index"]
-            if not isinstance(index, int) or not -1 <= index <= LARGEST_COUNT:
-                raise ValueError(f"the number of a running episode must lie in -1 to {LARGEST_COUNT}, got {index!r}")
-            running.carried, running.index, running.has_explored = plan, index, has_explored[i]
-            prefix = f"{i}.record."
-            record = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-            if record:  # files of the first schema have none
-                running.record.load_state_dict(record)
+        records: dict[str, dict[str, Any]] = defaultdict(dict)
+        for name, value in state.items():
+            index, is_of_record, field = name.partition(".record.")
+            if is_of_record:
+                records[index][field] = value
+        for i, (running, plan) in enumerate(zip(self.running, self._saved_plans(state), strict=True)):
+            running.carried, running.has_explored = plan, has_explored[i]
+            running.index = saved_count("the index of a running episode", state[f"{i}.index"], -1)
+            running.record.number = saved_count("the number of a running episode", state[f"{i}.number"])
+            if str(i) in records:  # files of the first schema have none
+                running.record.load_state_dict(records[str(i)])
 
     def _saved_plans(self, state: StateDict) -> list[PlanState]:
         controller, num_envs = self._controller, len(self.running)
-        expected = plans_to_tensors([controller.cold] * num_envs)
-        horizons = {name: [*state[name].shape[1:2]] for name in expected if name in state}
-        if horizons != {name: [*value.shape[1:2]] for name, value in expected.items()}:
+        if state["planner"] != self._planner_described():
             return [controller.cold] * num_envs
         plans = plans_from_tensors(state, controller.cold, num_envs, controller.horizon)
         return [plan if plan.age < controller.actions_per_plan else controller.cold for plan in plans]
-
-
-def saved_num_envs(state: StateDict) -> int:
-    """How many environments the saved episodes ran in.
-
-    Raises:
-        ValueError: no agent has so many.
-    """
-    num_envs = state.get("num_envs")
-    if not isinstance(num_envs, int) or not 1 <= num_envs <= MOST_ENVIRONMENTS:
-        raise ValueError(f"an agent has 1 to {MOST_ENVIRONMENTS} environments, got {num_envs!r}")
-    return num_envs
 
 
 def next_episode(store: TransitionStore, running: Sequence[RunningEpisode]) -> int:

@@ -17,6 +17,7 @@ from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.utils import configure_logger, get_latest_run_id, safe_mean
 from torch import Tensor
 
+from gym_dgpmpc.checks import saved_count
 from gym_dgpmpc.types import StateDict
 
 _INFO, _SUCCESSES = "ep_info.", "ep_successes"
@@ -116,15 +117,24 @@ class Logs:
         if run is not None and not re.fullmatch(r"[^./\\][^/\\]{0,200}", run):
             raise ValueError(f"the run's folder of logs must be the name of a folder, got {run!r}")
         self.run = run
-        self._waiting = [Waiting(str(n), float(v), int(c), out) for n, v, c, out in state.get("waiting", [])]
+        self._waiting = [_waiting(*each) for each in state["waiting"]]
         columns = {name.removeprefix(_INFO): value.tolist() for name, value in state.items() if name.startswith(_INFO)}
         infos = [
             {name: value for name, value in zip(columns, row, strict=True) if not math.isnan(value)}
             for row in zip(*columns.values(), strict=True)
         ]
+        if not all({"r", "l"} <= set(info) for info in infos):
+            raise ValueError("each of the latest episodes must have a return 'r' and a length 'l'")
         window = self._agent._stats_window_size
         self._agent.ep_info_buffer = deque(infos, maxlen=window)
         self._agent.ep_success_buffer = deque(state[_SUCCESSES].tolist(), maxlen=window)
+
+
+def _waiting(name: str, value: float, weight: int, left_out_of: list[str] | None) -> Waiting:
+    """A number of a file that waits, if it is one."""
+    if left_out_of is not None and not all(isinstance(each, str) for each in left_out_of):
+        raise ValueError(f"the formats that do not get {name} must be names, got {left_out_of!r}")
+    return Waiting(str(name), float(value), saved_count(f"the weight of {name}", weight), left_out_of)
 
 
 def _column(values: Iterable[Any]) -> Tensor:

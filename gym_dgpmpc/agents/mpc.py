@@ -837,6 +837,11 @@ class MPCAgent(BaseAlgorithm):
         """
         raise NotImplementedError(f"to take over what another agent has learned use {type(self).__name__}.load(path)")
 
+    @property
+    def planner_given(self) -> str | PlannerFactory | Planner:
+        """The planner as the constructor was given it."""
+        return self.composition.planner
+
     def arguments(self) -> dict[str, Any]:
         """The constructor arguments as they are now, those that a file holds."""
         own = {name: getattr(self, name) for name in self.own_settings()}

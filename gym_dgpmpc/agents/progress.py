@@ -5,15 +5,14 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from gym_dgpmpc.checks import saved_count
 from gym_dgpmpc.errors import ReliabilityWarning
 from gym_dgpmpc.randomness import derive_seed, split_seed
+from gym_dgpmpc.tasks.environment import flat_size
 from gym_dgpmpc.types import StateDict
 
 if TYPE_CHECKING:
     from gym_dgpmpc.agents.mpc import MPCAgent
-
-LARGEST_COUNT = 1 << 53
-"""What a file may claim of a counter."""
 
 
 class Progress:
@@ -38,14 +37,18 @@ class Progress:
             KeyError, ValueError: a counter is missing or out of its range.
         """
         agent = self._agent
-        counts = {name: state[name] for name in ("num_timesteps", "num_fitted", "num_episodes")}
-        for name, count in counts.items():
-            if not isinstance(count, int) or isinstance(count, bool) or not 0 <= count <= LARGEST_COUNT:
-                raise ValueError(f"{name} must be a count from 0 to {LARGEST_COUNT}, got {count!r}")
-        agent.num_timesteps, agent.num_fitted, agent._episode_num = counts.values()
+        agent.num_timesteps, agent.num_fitted, agent._episode_num = (
+            saved_count(name, state[name]) for name in ("num_timesteps", "num_fitted", "num_episodes")
+        )
         agent.begin_at(None)
-        if "last_observation" in state and len(state["last_observation"]) == agent.n_envs:
-            agent.begin_at(state["last_observation"].numpy(), state["last_episode_starts"].numpy())
+        if "last_observation" not in state:
+            return
+        observation, starts = state["last_observation"].numpy(), state["last_episode_starts"].numpy()
+        num_envs = len(observation)
+        if observation.shape != (num_envs, flat_size(agent.observation_space)) or starts.shape != (num_envs,):
+            raise ValueError(f"the last observation has the shape {observation.shape}, starts {starts.shape}")
+        if num_envs == agent.n_envs:
+            agent.begin_at(observation, starts)
 
 
 class RandomStreams:

@@ -10,19 +10,16 @@ Each noun of the agent writes and reads its own fields (`Checkpointed.nouns`); a
 """
 
 import importlib.metadata
-import math
-from typing import Any
 
 import torch
 from gymnasium import spaces
 from torch import Tensor
 
 from gym_dgpmpc.checkpoints.arguments import encode, saved_arguments
-from gym_dgpmpc.checkpoints.format import Checkpoint
+from gym_dgpmpc.checkpoints.format import Checkpoint, split
 from gym_dgpmpc.checkpoints.interface import Checkpointed
 from gym_dgpmpc.errors import CheckpointError, CheckpointWriteError
 from gym_dgpmpc.tasks.replay import describe_start
-from gym_dgpmpc.types import StateDict
 
 PACKAGES = ("gym_dgpmpc", "gymnasium", "numpy", "stable_baselines3", "torch")
 SPACES, BOUNDS = ("observation_space", "action_space"), ("low", "high")
@@ -38,46 +35,28 @@ def collect(agent: Checkpointed, *, gives_up: bool = False) -> Checkpoint:
     Raises:
         CheckpointWriteError: an argument is larger than `load` would believe.
     """
-    states = {name: noun.state_dict() for name, noun in agent.nouns().items()}
-    if gives_up:
+    states = {name: split(noun.state_dict()) for name, noun in agent.nouns().items()}
+    goes_on = agent.has_running_episode and not gives_up
+    if not goes_on:
         for name in ("last_observation", "last_episode_starts"):
-            states["progress"].pop(name, None)
+            states["progress"][1].pop(name, None)
     start = describe_start(agent.env)
     config = {
         "class": type(agent).__name__,
         "arguments": {name: encode(value) for name, value in agent.arguments().items()},
         "space_dtypes": {name: str(_space(agent, name).dtype) for name in SPACES},
-        "episode": None if start is None else {**start, "goes_on": "last_observation" in states["progress"]},
-        "values": {name: _without_tensors(state) for name, state in states.items()},
+        "num_envs": agent.n_envs,
+        "episode": None if start is None else {**start, "goes_on": goes_on},
+        "values": {name: values for name, (values, _) in states.items()},
         "versions": {name: _version(name) for name in PACKAGES},
     }
-    tensors = {name: _only_tensors(state) for name, state in states.items()}
+    tensors = {name: tensors for name, (_, tensors) in states.items()}
     checkpoint = Checkpoint(config, {**tensors, "spaces": _bounds(agent)})
     try:
-        saved_arguments(checkpoint, type(agent))
+        saved_arguments(checkpoint, agent, agent.planner_given)
     except CheckpointError as error:
         raise CheckpointWriteError(f"the agent is not saved, for it could not be loaded again: {error}") from error
     return checkpoint
-
-
-def to_json(value: Any) -> Any:
-    """A plain value as JSON has it, which has no NaN and no infinity."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return {"float": str(value)}
-    if isinstance(value, list | tuple):
-        return [to_json(each) for each in value]
-    if isinstance(value, dict):
-        return {name: to_json(each) for name, each in value.items()}
-    return value
-
-
-def from_json(value: Any) -> Any:
-    """The inverse of `to_json`."""
-    if isinstance(value, dict):
-        if set(value) == {"float"}:
-            return float(value["float"])
-        return {name: from_json(each) for name, each in value.items()}
-    return [from_json(each) for each in value] if isinstance(value, list) else value
 
 
 def _space(agent: Checkpointed, name: str) -> spaces.Box:
@@ -89,14 +68,6 @@ def _bounds(agent: Checkpointed) -> dict[str, Tensor]:
     return {
         f"{name}.{side}": torch.tensor(getattr(_space(agent, name), side)) for name in SPACES for side in BOUNDS
     }  # fmt: skip
-
-
-def _only_tensors(state: StateDict) -> dict[str, Tensor]:
-    return {name: value for name, value in state.items() if isinstance(value, Tensor)}
-
-
-def _without_tensors(state: StateDict) -> dict[str, Any]:
-    return {name: to_json(value) for name, value in state.items() if not isinstance(value, Tensor)}
 
 
 def _version(package: str) -> str:

@@ -10,6 +10,7 @@ Nothing is unpickled, ever, and no size in a file is believed (`reading.py`).
 import hashlib
 import io
 import json
+import math
 import os
 import re
 import zipfile
@@ -24,6 +25,7 @@ from gym_dgpmpc.checkpoints.files import replace_file
 from gym_dgpmpc.checkpoints.reading import UnsafeFileError, check_members, open_members, parse_json, parse_tensors
 from gym_dgpmpc.checkpoints.upgrade import upgraded
 from gym_dgpmpc.errors import CheckpointError, CheckpointWriteError
+from gym_dgpmpc.types import StateDict
 
 FORMAT = "gym_dgpmpc agent"
 SCHEMA = 5
@@ -44,6 +46,48 @@ class Checkpoint(NamedTuple):
     config: dict[str, Any]
     tensors: dict[str, dict[str, Tensor]]
     schema: int = SCHEMA
+
+    def state(self, noun: str) -> StateDict:
+        """The state of one noun: its tensors, and its plain values.
+
+        Raises:
+            CheckpointError: the file does not hold it.
+        """
+        tensors, values = self.tensors.get(noun), self.config.get("values")
+        own = values.get(noun, {}) if isinstance(values, dict) else None
+        if tensors is None or not isinstance(own, dict):
+            raise CheckpointError(f"the file does not hold the agent's {noun}")
+        twice = sorted(set(tensors) & set(own))
+        if twice:
+            raise CheckpointError(f"the file holds {twice} of the agent's {noun} twice")
+        return {**tensors, **{name: _from_plain(value) for name, value in own.items()}}
+
+
+def split(state: StateDict) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The plain values of a noun's state, as JSON has them, and its tensors; `Checkpoint.state` is the inverse."""
+    tensors = {name: value for name, value in state.items() if isinstance(value, Tensor)}
+    return {name: _to_plain(value) for name, value in state.items() if name not in tensors}, tensors
+
+
+NOT_FINITE = ("nan", "inf", "-inf")
+
+
+def _to_plain(value: Any) -> Any:
+    """A value as JSON has it, which knows no NaN and no infinity."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return {"float": str(value)}
+    if isinstance(value, list | tuple):
+        return [_to_plain(each) for each in value]
+    return {name: _to_plain(each) for name, each in value.items()} if isinstance(value, dict) else value
+
+
+def _from_plain(value: Any) -> Any:
+    """The inverse of `_to_plain`."""
+    if isinstance(value, dict):
+        if set(value) == {"float"} and value["float"] in NOT_FINITE:
+            return float(value["float"])
+        return {name: _from_plain(each) for name, each in value.items()}
+    return [_from_plain(each) for each in value] if isinstance(value, list) else value
 
 
 def checkpoint_path(path: str | os.PathLike[str]) -> Path:

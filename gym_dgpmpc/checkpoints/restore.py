@@ -3,7 +3,7 @@
 `load_agent` makes one; `restore` fills one that is made, which is also how a run goes on (`resume.py`).
 """
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -11,8 +11,8 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
-from gym_dgpmpc.checkpoints.arguments import asked_to_learn, class_of, saved_arguments
-from gym_dgpmpc.checkpoints.collect import SPACES, from_json
+from gym_dgpmpc.checkpoints.arguments import arguments_to_load, class_of
+from gym_dgpmpc.checkpoints.collect import SPACES
 from gym_dgpmpc.checkpoints.format import Checkpoint, CheckpointPath, read_checkpoint
 from gym_dgpmpc.checkpoints.interface import Checkpointed
 from gym_dgpmpc.errors import CheckpointError, DGPMPCError, UnknownRewardError
@@ -20,20 +20,21 @@ from gym_dgpmpc.randomness import derive_seed
 from gym_dgpmpc.tasks.dict_observations import layout
 from gym_dgpmpc.tasks.environment import wrapped_env
 from gym_dgpmpc.tasks.replay import set_options
-from gym_dgpmpc.types import StateDict
+
+Agent = TypeVar("Agent")
 
 MOST_ENVIRONMENTS = 10_000
-"""What a file may claim; see `saved_num_envs`."""
+"""What a file may claim."""
 
 
 def load_agent(
-    asked: Any,
+    asked: type[Agent],
     path: CheckpointPath,
     env: GymEnv | str | None,
     device: torch.device | str,
     force_reset: bool,
     replaced: dict[str, Any],
-) -> Any:
+) -> Agent:
     """Make the agent that a file holds; see `MPCAgent.load`.
 
     Args:
@@ -49,20 +50,19 @@ def load_agent(
     """
     checkpoint = read_checkpoint(path)
     agent_class = class_of(checkpoint, asked)
-    arguments = saved_arguments(checkpoint, agent_class, replaced.get("planner"))
-    arguments |= asked_to_learn(checkpoint) | replaced
+    arguments, num_envs = arguments_to_load(checkpoint, agent_class, replaced), saved_num_envs(checkpoint)
     if env is not None:
         env = wrapped_env(env)
         _refuse_another_environment(env, checkpoint)
     try:
         agent = agent_class(env=env, device=device, _init_setup_model=False, **arguments)
         agent.observation_space, agent.action_space = saved_spaces(checkpoint)
-        agent.n_envs = saved_num_envs(checkpoint) if env is None else env.num_envs
+        agent.n_envs = num_envs if env is None else env.num_envs
         agent._setup_model()
     except DGPMPCError:
         raise
     except Exception as error:
-        raise CheckpointError(f"no {agent_class.__name__} can be made with {arguments}: {error}") from error
+        raise CheckpointError(f"no {checkpoint.config['class']} can be made with {arguments}: {error}") from error
     restore(agent, checkpoint, keep_seed="seed" not in replaced)
     if force_reset:
         agent.begin_at(None)
@@ -73,6 +73,7 @@ def load_agent(
         agent.env.seed(derive_seed(agent.seed, "environment", agent.num_timesteps))
     if agent.env is not None and force_reset:
         set_options(agent.env, about_environment(checkpoint).get("reset_options"))
+    assert isinstance(agent, asked)
     return agent
 
 
@@ -88,10 +89,16 @@ def restore(agent: Checkpointed, checkpoint: Checkpoint, *, keep_seed: bool = Tr
         CheckpointError: they do not fit. The agent may hold a part of them then, and must not be used.
     """
     try:
+        unknown = {*checkpoint.tensors, *checkpoint.config["values"]} - {*agent.nouns(), "spaces"}
+        if unknown:
+            raise CheckpointError(
+                f"the file holds {sorted(unknown)}, which no {type(agent).__name__} of this version has: load it with "
+                "the version that wrote it"
+            )
         for name in agent.nouns():
             if name != "random" or keep_seed:
                 # Looked up anew, for a noun may be made again by the one before it.
-                agent.nouns()[name].load_state_dict(saved_state(checkpoint, name))
+                agent.nouns()[name].load_state_dict(checkpoint.state(name))
     except UnknownRewardError as error:
         raise CheckpointError(
             "the file's model predicts the reward or termination too: pass dynamics=... as the function that made it"
@@ -100,18 +107,6 @@ def restore(agent: Checkpointed, checkpoint: Checkpoint, *, keep_seed: bool = Tr
         raise
     except Exception as error:
         raise CheckpointError(f"the file does not fit a {type(agent).__name__} of its arguments: {error!r}") from error
-
-
-def saved_state(checkpoint: Checkpoint, noun: str) -> StateDict:
-    """The state of one noun: its tensors, and its plain values.
-
-    Raises:
-        CheckpointError: the file does not hold it.
-    """
-    tensors, values = checkpoint.tensors.get(noun), checkpoint.config.get("values")
-    if tensors is None or not isinstance(values, dict) or not isinstance(values.get(noun, {}), dict):
-        raise CheckpointError(f"the file does not hold the agent's {noun}")
-    return {**tensors, **{name: from_json(value) for name, value in values.get(noun, {}).items()}}
 
 
 def saved_spaces(checkpoint: Checkpoint) -> tuple[spaces.Box, spaces.Box]:
@@ -137,15 +132,15 @@ def saved_num_envs(checkpoint: Checkpoint) -> int:
     Raises:
         CheckpointError: the file does not say, or no agent has so many.
     """
-    num_envs = saved_state(checkpoint, "episodes").get("num_envs")
-    if not isinstance(num_envs, int) or not 1 <= num_envs <= MOST_ENVIRONMENTS:
+    num_envs = checkpoint.config.get("num_envs")
+    if not isinstance(num_envs, int) or isinstance(num_envs, bool) or not 1 <= num_envs <= MOST_ENVIRONMENTS:
         raise CheckpointError(f"an agent has 1 to {MOST_ENVIRONMENTS} environments, the file says {num_envs!r}")
     return num_envs
 
 
 def about_environment(checkpoint: Checkpoint) -> dict[str, Any]:
     """What a file says of its agent's environment: "environment" (its id), "observation_parts", "reset_options"."""
-    about = saved_state(checkpoint, "task").get("about_environment")
+    about = checkpoint.state("task").get("about_environment")
     return about if isinstance(about, dict) else {}
 
 

@@ -8,8 +8,8 @@ from numpy import ndarray
 
 from gym_dgpmpc.checkpoints.arguments import encode, saved_arguments
 from gym_dgpmpc.checkpoints.format import Checkpoint
-from gym_dgpmpc.checkpoints.interface import Checkpointed, running_episode
-from gym_dgpmpc.checkpoints.restore import about_environment, restore, saved_num_envs, saved_spaces, saved_state
+from gym_dgpmpc.checkpoints.interface import Checkpointed
+from gym_dgpmpc.checkpoints.restore import about_environment, restore, saved_num_envs, saved_spaces
 from gym_dgpmpc.errors import CheckpointError, ReliabilityWarning
 from gym_dgpmpc.randomness import derive_seed
 from gym_dgpmpc.tasks.environment import environment_id
@@ -50,7 +50,7 @@ def resume_agent(agent: Checkpointed, checkpoint: Checkpoint) -> None:
             _continue_episode(agent, checkpoint, episode)
         else:
             set_present_generators(agent.env, episode)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
         if isinstance(error, CheckpointError):
             raise
         raise CheckpointError(f"the checkpoint does not say how its episode began: {error!r}") from error
@@ -58,7 +58,7 @@ def resume_agent(agent: Checkpointed, checkpoint: Checkpoint) -> None:
 
 def _continue_episode(agent: Checkpointed, checkpoint: Checkpoint, episode: dict[str, Any]) -> None:
     """Begin the episode again and repeat its actions; on a difference, warn and let a new one begin."""
-    rows = np.flatnonzero(agent.store.episodes.numpy() == running_episode(agent))
+    rows = np.flatnonzero(agent.store.episodes.numpy() == agent.collector.running[0].index)
     rows = rows[len(rows) - episode["num_steps"] :] if episode["num_steps"] else rows[:0]
     last = checkpoint.tensors["progress"]["last_observation"].numpy()
     data = agent.store.transitions()
@@ -90,14 +90,14 @@ def _refuse_another(agent: Checkpointed, checkpoint: Checkpoint) -> None:
     name = checkpoint.config.get("class")
     if name != type(agent).__name__:
         raise CheckpointError(f"the checkpoint is of a {name}, the agent is a {type(agent).__name__}")
-    saved, present = saved_arguments(checkpoint, type(agent)), agent.arguments()
+    saved, present = saved_arguments(checkpoint, agent, agent.planner_given), agent.arguments()
     given_seed = {"seed"} if agent.seeds_environment else set()
     differing = [
         f"{name} was {saved[name]}, now {present.get(name)}"
         for name in sorted(set(saved) - MAY_DIFFER - ({"seed"} - given_seed))
         if encode(saved[name]) != encode(present.get(name))
     ]
-    to_learn = saved_state(checkpoint, "task").get("to_learn", agent.task.to_learn)
+    to_learn = checkpoint.state("task").get("to_learn", agent.task.to_learn)
     if to_learn != agent.task.to_learn:
         differing.append(f"what was to be learned was {to_learn}, now {agent.task.to_learn}")
     num_envs = saved_num_envs(checkpoint)

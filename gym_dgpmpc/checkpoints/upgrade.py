@@ -10,6 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+MOST_MISSING = 10
+"""A table of the summaries of episodes may have this many times the numbers that a file holds of them."""
 SPACES = ("observation_space", "action_space")
 
 Config = dict[str, Any]
@@ -24,14 +26,14 @@ def upgraded(config: Config, tensors: Tensors, schema: int) -> tuple[Config, Ten
     """
     if schema >= 5:
         return config, tensors
-    own, values = tensors["agent"], dict(config["values"])
-    if config["values"].get("agent"):
-        raise ValueError(f"the part 'agent' has plain values: {config['values']['agent']}")
+    own = tensors["agent"]
     episodes, episode_values = _episodes(config, own, schema)
     logs, log_values = _logs(config, own, schema)
     last: dict[str, Tensor] = {name: own[name] for name in ("last_observation", "last_episode_starts") if name in own}
     counters = config["counters"]
-    values |= {
+    values = {
+        "dynamics": config["values"].get("dynamics", {}),
+        "transitions": config["values"].get("transitions", {}),
         "task": _task(config),
         "progress": {
             "num_timesteps": counters["num_timesteps"],
@@ -58,9 +60,10 @@ def upgraded(config: Config, tensors: Tensors, schema: int) -> tuple[Config, Ten
     }
     if "arguments" in present and isinstance(present["arguments"], dict):
         # Then every named agent planned by CEM; of a plain MPCAgent the planner was never saved.
-        planner = None if config.get("class") == "MPCAgent" else "cem"
+        planner = "cem" if "num_candidates" in present["arguments"] else None
         present["arguments"] = {"planner": planner, **present["arguments"]}
-    return {**present, "episode": config.get("episode"), "values": values}, parts
+    num_envs = len(config["running"]) if schema > 2 else 1
+    return {**present, "num_envs": num_envs, "episode": config.get("episode"), "values": values}, parts
 
 
 def _task(config: Config) -> dict[str, Any]:
@@ -78,13 +81,17 @@ def _episodes(config: Config, own: dict[str, Tensor], schema: int) -> tuple[dict
         running = [{"index": counters["_episode_index"], "has_explored": counters["_explored_episode"]}]
     else:
         running = config["running"]
-    values: dict[str, Any] = {"num_envs": len(running)}
+    # Every plan was a Gaussian of [H, A]; whose planner's it was, no file said.
+    fields = {name: list(own[f"plan.{name}"].shape[1:]) for name in ("mean", "std")}
+    values: dict[str, Any] = {"planner": {"class": "CEM", "fields": fields}}
     tensors = {name: own[name] for name in ("plan.mean", "plan.std", "plan.age")}
     for i, episode in enumerate(running):
         values |= {f"{i}.index": int(episode["index"]), f"{i}.has_explored": bool(episode["has_explored"])}
-        prefix = f"record.{i}." if schema > 2 else "record."
-        record = {name.removeprefix(prefix): value for name, value in own.items() if name.startswith(prefix)}
-        tensors |= {f"{i}.record.{name}": value for name, value in record.items()}
+        values[f"{i}.number"] = config["counters"]["_episode_num"] + 1
+    for name, value in own.items():
+        if name.startswith("record."):
+            index, _, field = name.removeprefix("record.").partition(".") if schema > 2 else ("0", "", name[7:])
+            tensors[f"{index}.record.{field}"] = value
     return tensors, values
 
 
@@ -94,6 +101,8 @@ def _logs(config: Config, own: dict[str, Tensor], schema: int) -> tuple[dict[str
         return {name: value for name, value in own.items() if name.startswith("ep_")}, values
     infos = config["episode_infos"]
     names = dict.fromkeys(name for info in infos for name in info)
+    if len(names) * len(infos) > MOST_MISSING * sum(map(len, infos)):
+        raise ValueError(f"{len(infos)} summaries of episodes have {len(names)} names between them")
     columns = {f"ep_info.{name}": [float(info.get(name, "nan")) for info in infos] for name in names}
     columns["ep_successes"] = [float(success) for success in config["episode_successes"]]
     return {name: torch.tensor(column, dtype=torch.float64) for name, column in columns.items()}, values

@@ -88,7 +88,7 @@ class CEM:
         TypeError, ValueError: naming the argument, what was expected and what was received.
     """
 
-    largest: ClassVar[Mapping[str, int]] = MappingProxyType({"num_candidates": 10**5})
+    largest: ClassVar[Mapping[str, int]] = MappingProxyType({"horizon": 10**4, "num_candidates": 10**5})
     """What a file may claim; see `settings.settings_of`."""
 
     def __init__(

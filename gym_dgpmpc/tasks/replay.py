@@ -163,10 +163,12 @@ def set_options(vec_env: VecEnv, options: Any) -> None:
     Raises:
         CheckpointError: they are none.
     """
-    if not options or not any(options) or not vec_env.has_attr("options_to_reset"):
+    if options is None:
         return
     if not isinstance(options, list) or not all(each is None or isinstance(each, dict) for each in options):
         raise CheckpointError(f"the options for the environment's reset cannot be read: {options!r}")
+    if not any(options) or not vec_env.has_attr("options_to_reset"):
+        return
     if len(options) == vec_env.num_envs:
         vec_env.set_options([each or {} for each in options])
 

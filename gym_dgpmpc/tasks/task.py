@@ -208,13 +208,19 @@ class Task:
 
         Raises:
             UnknownRewardError: the saved model predicted more than a ready-made one can.
+            KeyError, ValueError: the state is not one of a task.
         """
-        reward, terminated = bool(state.get("reward", False)), bool(state.get("terminated", False))
+        reward, terminated, had_terminated_fn, about = (
+            state[name] for name in ("reward", "terminated", "has_terminated_fn", "about_environment")
+        )
+        for name in ("reward", "terminated", "has_terminated_fn"):
+            if not isinstance(state[name], bool):
+                raise ValueError(f"{name} must be true or false, got {state[name]!r}")
+        if not isinstance(about, dict):
+            raise ValueError(f"about_environment must be an object, got {about!r}")
         if (reward, terminated) != (self.modelled.reward, self.modelled.terminated):
             self.model(reward=reward, terminated=terminated)
-        about = state.get("about_environment", {})
-        self._loaded_about = dict(about) if isinstance(about, dict) else {}
-        self._had_terminated_fn = bool(state.get("has_terminated_fn", False))
+        self._loaded_about, self._had_terminated_fn = about, had_terminated_fn
         self._forget_planned()
 
     def _forget_planned(self) -> None:

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from gym_dgpmpc.agents import MPCAgent
+from gym_dgpmpc.agents.logs import Logs
 from gym_dgpmpc.checkpoints import folder as run_checkpoints
 from gym_dgpmpc.checkpoints.collect import collect
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
@@ -483,12 +483,12 @@ def test_outside_the_main_thread_there_are_no_signals_to_handle(tmp_path):
 
 
 def test_a_run_killed_before_it_has_logged_goes_on_in_the_folder_that_it_had_chosen(whole, tmp_path, monkeypatch):
-    def killed(*_):
+    def killed(*_, **__):
         raise KeyboardInterrupt
 
     (tmp_path / "logs" / "Other_7").mkdir(parents=True)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(MPCAgent, "_new_logger", killed)
+        patch.setattr(Logs, "open", killed)
         train(tmp_path, actions_per_plan=2)
     train(tmp_path, kill_at=12, actions_per_plan=2)
     (tmp_path / "logs" / "MPC_2").mkdir()  # of another run, begun in between

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 from pathlib import Path
 
 import torch
@@ -10,8 +11,8 @@ from tensorboard.compat.proto.event_pb2 import Event
 
 from gym_dgpmpc.checkpoints.format import read_checkpoint
 
-CLOCK = {"record.0.seconds", "record.0.plan_seconds", "ep_info.t"}
-"""Tensors of a checkpoint that tell the time."""
+CLOCK = re.compile(r"\d+\.record\.(plan_)?seconds|ep_info\.t")
+"""Names of tensors of a checkpoint that tell the time."""
 CLOCK_COLUMNS = {"seconds", "planning_seconds"}
 CLOCK_TAGS = ("time/", "train/seconds")
 
@@ -25,7 +26,7 @@ def checkpoint_differences(one, other):
             found.append(f"config: {name}: {one.config.get(name)} != {other.config.get(name)}")
     for part in {*one.tensors, *other.tensors}:
         first, second = one.tensors.get(part, {}), other.tensors.get(part, {})
-        names = {*first, *second} - CLOCK
+        names = {name for name in (*first, *second) if not CLOCK.fullmatch(name)}
         found += [f"{part}: {name}" for name in sorted(names) if not _same(first.get(name), second.get(name))]
     return found
 
@@ -76,8 +77,9 @@ def _same_points(tag, one, other):
 
 
 def _without_clock(name, value):
-    if name == "pending_logs":
-        return [entry for entry in value if not entry[0].startswith(CLOCK_TAGS)]
+    if name == "values":
+        waiting = [entry for entry in value["logs"]["waiting"] if not entry[0].startswith(CLOCK_TAGS)]
+        return value | {"logs": value["logs"] | {"waiting": waiting}}
     if name == "arguments":
         return {key: argument for key, argument in value.items() if key != "tensorboard_log"}  # the folders' names
     return value

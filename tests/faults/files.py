@@ -31,6 +31,8 @@ from tests.runs.toy import EPISODE_STEPS
 
 MEMORY_BOUND = 64 << 20
 """Bytes of Python objects that reading one of these files may allocate at its peak; the files have some 50 kB."""
+OLDER = Path(__file__).parents[1] / "checkpoints" / "files"
+"""Files of older schemas."""
 ADDRESS_SPACE = 2 << 30
 """Bytes by which the process may grow, tensors included."""
 
@@ -47,11 +49,11 @@ def members_of(data):
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def zipped(members, **options):
+def zipped(members, schema=SCHEMA, **options):
     """A zip of these members with a manifest that fits them, so that checks beyond the checksums are reached."""
     members = {name: data for name, data in members.items() if name != "manifest.json"}
     table = {name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in members.items()}
-    manifest = {"format": "gym_dgpmpc agent", "schema": SCHEMA, "members": table}
+    manifest = {"format": "gym_dgpmpc agent", "schema": schema, "members": table}
     return raw_zip({**members, "manifest.json": json.dumps(manifest).encode()}, **options)
 
 
@@ -79,6 +81,7 @@ def mutated(rng, data):
         place = rng.randrange(len(data))
         return data[:place] + data[place + rng.randrange(1, 200) :]
     members = members_of(data)
+    schema = json.loads(members["manifest.json"])["schema"]
     name = rng.choice([name for name in members if name != "manifest.json"])
     if kind == 4:
         members[name] = flipped(rng, members[name], rng.choice([1, 1, 8]))
@@ -88,7 +91,7 @@ def mutated(rng, data):
         config = json.loads(members["config.json"])
         _change_something(rng, config)
         members["config.json"] = json.dumps(config).encode()
-    return zipped(members)
+    return zipped(members, schema)
 
 
 def flipped(rng, data, count):
@@ -162,6 +165,8 @@ def hostile_files(data):
     """Name -> bytes of files made to run code, to fill the memory, or to write elsewhere."""
     members = members_of(data)
     config = json.loads(members["config.json"])
+    older = members_of((OLDER / "schema3.zip").read_bytes())
+    old_config = json.loads(older["config.json"])
     harm = pickle.dumps(Harm())
     legacy = io.BytesIO()
     torch.save({"policy": Harm()}, legacy)
@@ -182,6 +187,12 @@ def hostile_files(data):
     def tensor(dtype="F64", shape=(1,), offsets=(0, 8), body=bytes(8)):
         table = {"x": {"dtype": dtype, "shape": list(shape), "data_offsets": list(offsets)}}
         return with_member("dynamics.safetensors", header(table, body))
+
+    def with_old_config(**changes):
+        return zipped({**older, "config.json": json.dumps(old_config | changes).encode()}, schema=3)
+
+    def with_values(noun, **changes):
+        return with_config(values=config["values"] | {noun: config["values"][noun] | changes})
 
     def with_tensors(part, **tensors):
         return with_member(f"{part}.safetensors", save_tensors(tensors))
@@ -218,6 +229,27 @@ def hostile_files(data):
         "layers beyond memory": with_arguments(num_layers=10**7),
         "features beyond memory": with_arguments(num_features=10**7),
         "inducing points beyond memory": with_arguments(num_inducing=10**7),
+        "a planner that is no name": with_arguments(planner=["cem"]),
+        "an unknown planner": with_arguments(planner="os.system"),
+        "a list as limit": with_arguments(num_layers=[10**9]),
+        "environments beyond memory": with_config(num_envs=10**9),
+        "an unknown noun": with_config(values=config["values"] | {"evil": {}}),
+        "a list of nouns": with_config(values=[1, {}]),
+        "a noun that is a number": with_config(values=config["values"] | {"task": 3}),
+        "a number that is none": with_values("progress", num_timesteps={"float": "evil"}),
+        "a counter beyond counting": with_values("progress", num_timesteps=10**300),
+        "infinite numbers of episodes": with_values("progress", num_episodes={"float": "inf"}),
+        "an index of no episode": with_values("episodes", **{"0.index": -(10**9)}),
+        "a planner that is another": with_values("episodes", planner={"class": "evil", "fields": {}}),
+        "junk about the environment": with_values("task", about_environment={"environment": [{}], "reset_options": 3}),
+        "nested junk about the environment": with_values("task", about_environment={"observation_parts": [[{}]]}),
+        "junk to learn": with_values("task", to_learn={"reward_fn": {"reward_fn": True}, "evil": True}),
+        "logs in another folder": with_values("logs", run="../../evil"),
+        "logs of no weight": with_values("logs", waiting=[["a", 1.0, -1, None]]),
+        "logs in no format": with_values("logs", waiting=[["a", 1.0, 0, 7]]),
+        "plain values in place of tensors": with_values("transitions", reward=[0.0] * 10**5),
+        "many names in an old file": with_old_config(episode_infos=[{f"{i}": 1} for i in range(10**5)]),
+        "many episodes in an old file": with_old_config(running=[{"index": 0, "has_explored": True}] * 30_000),
         "a number of 3 million digits": with_member("config.json", b'{"class": ' + huge.encode() + b"}"),
         "infinity": with_member("config.json", b'{"class": Infinity}'),
         "deep lists": with_member("config.json", b'{"a": ' + b"[" * 100_000 + b"]" * 100_000 + b"}"),
@@ -250,16 +282,16 @@ def hostile_files(data):
         "a tensor of no size": tensor(shape=(0, 2**61), offsets=(0, 0), body=b""),
         "transitions of another kind": with_tensors("transitions", reward=torch.zeros(3, dtype=torch.int64)),
         "generators of another kind": with_tensors(
-            "generators", **{name: torch.zeros(5056, dtype=torch.float64) for name in Generators._fields}
+            "random", **{name: torch.zeros(5056, dtype=torch.float64) for name in Generators._fields}
         ),
         "generators of random bytes": with_tensors(
-            "generators",
+            "random",
             **{
                 name: torch.randint(256, (5056,), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
                 for name in Generators._fields
             },
         ),
-        "no tensors at all": with_tensors("agent"),
+        "no tensors at all": with_tensors("episodes"),
         "a FIFO": None,
         "a folder": None,
     }
@@ -367,14 +399,18 @@ def try_files(files, folder, observation):
 
 
 def run_mutations(folder, number, seed=0):
-    """Read ``number`` mutated files: ({outcome: count}, what was wrong)."""
+    """Read ``number`` mutated files, every fourth of an older schema: ({outcome: count}, what was wrong)."""
     folder = Path(folder) / "mutations"
     folder.mkdir(parents=True)
     agent = an_agent(folder / "agent.zip")
-    data = (folder / "agent.zip").read_bytes()
+    assert read_checkpoint(folder / "agent.zip")  # zipfile imports an encoding with the first name that it reads
+    present = (folder / "agent.zip").read_bytes()
+    older = [path.read_bytes() for path in sorted(OLDER.glob("schema*.zip"))]
     observation = agent.store.transitions().observation[0].numpy()
     rng = random.Random(seed)
-    files = ((f"mutation {i}", mutated(rng, data)) for i in range(number))
+    files = (
+        (f"mutation {i}", mutated(rng, older[i // 4 % len(older)] if i % 4 == 3 else present)) for i in range(number)
+    )
     result = run_in_child(lambda: try_files(files, folder, observation))
     return result["counts"], result["wrong"]
 

@@ -61,11 +61,7 @@ class Task(NamedTuple):
 
 def train_by_command(env_id, *options):
     arguments = ["train", env_id, "--no-video", "--no-progress", "--episodes=3", *options]
-    names = {"num_layers": "layers", "num_inducing": "inducing", "num_features": "features"}
-    names |= {"num_particles": "particles", "num_candidates": "candidates", "num_iterations": "iterations"}
-    names |= {"first_training_iterations": "first-training", "training_iterations": "training"}
-    names |= {"num_samples": "samples", "sample_spacing": "spacing", "resample_steps": "resample"}
-    arguments += [f"--{names.get(name, name)}={value}" for name, value in TINY.items()]
+    arguments += [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]
     return lambda folder: cli.app([*arguments, "--out", str(folder)], standalone_mode=False)
 
 
