@@ -107,7 +107,7 @@ class MPCAgent(BaseAlgorithm):
             first termination on.
         observation_spec: how the model reads observations; default: the environment's ``observation_spec``, or what is
             known. For Dict observations it indexes the vector of the parts in alphabetical order.
-        num_particles: P, worlds drawn for each plan.
+        num_particles: worlds drawn for each plan, P, over which a return is averaged.
         actions_per_plan: actions performed of each plan before the next one is made.
         learning_starts: transitions before the first training, of random actions if they were not logged; default:
             those of one episode in each environment, or ``train_freq`` if these come first.

@@ -73,7 +73,8 @@ def _option(name: str, kind: Any, text: str, default: str | bool, panel: str) ->
     names = [f"--{dashed}", *([f"--{dashed.removeprefix('num-')}"] if dashed.startswith("num-") else [])]
     if kind is bool:
         names = [f"--{dashed}/--no-{dashed}"]
-    option = typer.Option(*names, help=text[:1].upper() + text[1:], show_default=default, rich_help_panel=panel)
+    text = f"{text[:1].upper()}{text[1:]}".replace("``", "")
+    option = typer.Option(*names, help=text, show_default=default, rich_help_panel=panel)
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind | None, option]
     )
