@@ -1,8 +1,9 @@
 """Builds the package's C++ source once, with the compiler of the machine that it runs on, and loads it.
 
 The result is kept in the user's cache folder (`XDG_CACHE_HOME`, by default `~/.cache`), under a name that says which
-source, compiler, flags and processor it was built from and for. Used by `compiled_rollout.py`; without a compiler the
-package works all the same, only slower.
+source, compiler, flags and processor it was built from and for, and which bytes it holds: a file that does not hold
+them is built anew, for loading it may kill the process. Where that folder cannot be used, a temporary one can. Used by
+`compiled_rollout.py`; without a compiler the package works all the same, only slower.
 """
 
 import atexit
@@ -15,6 +16,7 @@ import shutil
 import subprocess
 import tempfile
 import warnings
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 
@@ -33,7 +35,7 @@ def load(name: str) -> ctypes.CDLL | None:
     """The library built from ``native/NAME.cpp``; None, with one warning, if it cannot be built."""
     source = files("gym_dgpmpc.dynamics.deep_gp").joinpath("native", f"{name}.cpp").read_bytes()
     try:
-        return ctypes.CDLL(str(_build(name, source)))
+        return _load(name, source)
     except (CompilerError, OSError, subprocess.SubprocessError) as error:
         warnings.warn(
             f"planning does without compiled code, several times slower, because {error}. Install a C++ compiler "
@@ -57,40 +59,85 @@ def find_compiler() -> list[str]:
 
 
 def cache_folder() -> Path:
-    """Where built libraries are kept: a folder that only this user can write to, or one that ends with the process.
+    """Where built libraries are kept: a folder that only this user can write to.
 
     Raises:
         CompilerError: the folder belongs to someone else, who could have put anything there.
+        OSError: there is no such folder, and none can be made.
     """
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(base) / "gym_dgpmpc"
+    base = os.environ.get("XDG_CACHE_HOME")
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError:  # no home folder, or one that cannot be written: build anew in every process
-        temporary = tempfile.mkdtemp(prefix="gym_dgpmpc-")
-        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-        return Path(temporary)
+        folder = (Path(base) if base else Path.home() / ".cache") / "gym_dgpmpc"
+    except RuntimeError as error:  # no HOME, and a user whom the system does not know: as containers have it
+        raise FileNotFoundError(str(error)) from error
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     status = folder.stat()
     if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o022):
         raise CompilerError(f"other users can write to {folder}: remove it, or set XDG_CACHE_HOME")
     return folder
 
 
-def _build(name: str, source: bytes) -> Path:
-    """The path of the library, built if it is not in the cache."""
-    compiler = find_compiler()
+def _load(name: str, source: bytes) -> ctypes.CDLL:
+    """The library: the one that is kept, else a new one.
+
+    Raises:
+        CompilerError, subprocess.SubprocessError: it cannot be built.
+        OSError: nowhere can it be written and loaded from.
+    """
+    command = [*find_compiler(), *FLAGS, "-x", "c++", "-"]
     # All that the compiler predefines with these flags: its version and the processor's instructions among them.
-    described = _run([*compiler, *FLAGS, "-dM", "-E", "-x", "c++", "-"], b"")
-    digest = hashlib.sha256(b"\0".join([source, " ".join([*compiler, *FLAGS]).encode(), described])).hexdigest()
-    library = cache_folder() / f"{name}-{digest[:24]}.so"
-    if not library.exists():
-        temporary = library.with_name(f"{library.name}.{secrets.token_hex(4)}.tmp")
-        try:
-            _run([*compiler, *FLAGS, "-x", "c++", "-", "-o", str(temporary)], source)
-            os.replace(temporary, library)
-        finally:
-            temporary.unlink(missing_ok=True)
+    described = _run([*command, "-dM", "-E"], b"")
+    digest = hashlib.sha256(b"\0".join([source, " ".join(command).encode(), described])).hexdigest()
+    stem = f"{name}-{digest[:24]}"
+    with suppress(OSError):
+        library = _kept(cache_folder(), stem)
+        if library is not None:
+            return ctypes.CDLL(str(library))
+    built = _build(command, source)
+    with suppress(OSError):  # a folder that is full, cannot be written, or that nothing may be executed from
+        return ctypes.CDLL(str(_keep(cache_folder(), stem, built)))
+    temporary = Path(tempfile.mkdtemp(prefix="gym_dgpmpc-"))
+    atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+    return ctypes.CDLL(str(_keep(temporary, stem, built)))
+
+
+def _build(command: list[str], source: bytes) -> bytes:
+    """The bytes of a library built from the source."""
+    with tempfile.TemporaryDirectory(prefix="gym_dgpmpc-") as folder:
+        library = Path(folder) / "built.so"
+        _run([*command, "-o", str(library)], source)
+        if not library.exists():
+            raise CompilerError(f"{command[0]} wrote no library")
+        return library.read_bytes()
+
+
+def _kept(folder: Path, stem: str) -> Path | None:
+    """The library of an earlier process, if it holds the bytes that its name tells; a damaged one is removed."""
+    for library in folder.glob(f"{stem}-*.so"):
+        if library.name == _file_name(stem, library.read_bytes()):
+            return library
+        library.unlink()
+    return None
+
+
+def _keep(folder: Path, stem: str, built: bytes) -> Path:
+    """Write the library so that neither another process nor a power cut sees half of it."""
+    library = folder / _file_name(stem, built)
+    temporary = library.with_name(f"{library.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with open(temporary, "xb") as file:
+            file.write(built)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, library)
+    finally:
+        temporary.unlink(missing_ok=True)
     return library
+
+
+def _file_name(stem: str, content: bytes) -> str:
+    """The name of a library that holds these bytes."""
+    return f"{stem}-{hashlib.sha256(content).hexdigest()[:24]}.so"
 
 
 def _run(command: list[str], given: bytes) -> bytes:

@@ -89,29 +89,94 @@ def test_a_cache_that_others_can_write_to_is_not_used(tmp_path):
     assert stat.S_IMODE(compiler.cache_folder().stat().st_mode) == 0o700
 
 
-@needs_compiler
-def test_without_a_home_it_is_built_elsewhere_and_removed_in_the_end(tmp_path):
-    (tmp_path / "file").write_text("not a folder")
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
+def load_in_another_process(**environment):
+    """What a new process says that loads the library and counts the files in TMPDIR while it has it."""
     program = """
 import os
 from gym_dgpmpc.dynamics.deep_gp import compiler
 assert compiler.load("rollout") is not None
 print(len(os.listdir(os.environ["TMPDIR"])))
 """
-    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "file"), "TMPDIR": str(temporary)}
-    done = subprocess.run(
+    return subprocess.run(
         [sys.executable, "-c", program],
-        env=environment,
+        env={name: value for name, value in (os.environ | environment).items() if value is not None},
         cwd=Path(__file__).parents[3],
         capture_output=True,
         text=True,
         timeout=120,
         check=False,
     )
+
+
+@needs_compiler
+def test_without_a_folder_to_write_to_it_is_built_elsewhere_and_removed_in_the_end(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    done = load_in_another_process(XDG_CACHE_HOME=str(tmp_path / "file"), TMPDIR=str(temporary))
     assert done.stdout == "1\n", done.stderr
     assert not list(temporary.iterdir())
+
+
+@needs_compiler
+@pytest.mark.parametrize("failing", ["home", "write", "execute"])
+def test_a_cache_that_cannot_be_used_is_done_without(failing, tmp_path, monkeypatch):
+    """No HOME and an unknown user (containers); a folder that is full; one that nothing may be executed from."""
+
+    def fail(*_):
+        raise {"home": RuntimeError("no home"), "write": OSError(28, "no space left on device")}[failing]
+
+    real = compiler.ctypes.CDLL
+
+    def refuse_the_cache(path):
+        if path.startswith(str(tmp_path)):
+            raise OSError("failed to map segment from shared object")
+        return real(path)
+
+    if failing == "home":
+        monkeypatch.delenv("XDG_CACHE_HOME")
+        monkeypatch.setattr(Path, "home", fail)
+    elif failing == "write":
+        keep = compiler._keep
+        monkeypatch.setattr(compiler, "_keep", lambda f, *rest: fail() if f.is_relative_to(tmp_path) else keep(f, *rest))
+    else:
+        monkeypatch.setattr(compiler.ctypes, "CDLL", refuse_the_cache)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert compiler.load("rollout").units() > 0
+
+
+def test_without_any_folder_there_is_the_warning(monkeypatch):
+    def fail(*_, **__):
+        raise FileNotFoundError("no usable temporary directory")
+
+    monkeypatch.setattr(compiler.tempfile, "TemporaryDirectory", fail)
+    monkeypatch.setattr(compiler, "find_compiler", lambda: ["echo"])
+    with pytest.warns(UserWarning, match="temporary directory"):
+        assert compiler.load("rollout") is None
+
+
+@needs_compiler
+@pytest.mark.parametrize("size", [4096, 0])
+def test_a_damaged_library_is_built_anew(size, tmp_path):
+    """Loading one that was cut would kill the process: its pages are missing when they are touched."""
+    assert compiler.load("rollout") is not None
+    (library,) = (tmp_path / "gym_dgpmpc").iterdir()
+    whole = library.read_bytes()
+    library.unlink()  # not cut where it is: this process has it mapped
+    library.write_bytes(whole[:size])
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    done = load_in_another_process(TMPDIR=str(temporary))
+    assert (done.returncode, done.stdout, done.stderr) == (0, "0\n", "")
+    (again,) = (tmp_path / "gym_dgpmpc").iterdir()
+    assert again.stat().st_size == len(whole)
+
+
+def test_a_compiler_that_writes_nothing_is_named(monkeypatch):
+    monkeypatch.setenv("CXX", "echo")
+    with pytest.warns(UserWarning, match="echo wrote no library"):
+        assert compiler.load("rollout") is None
 
 
 def test_memory_that_cannot_be_had_is_an_error(monkeypatch):
