@@ -16,7 +16,7 @@ MODULES = {
 }
 
 LAYERS = (
-    {"types", "errors", "checks", "randomness", "settings"},
+    {"types", "errors", "checks", "forks", "randomness", "settings"},
     {"envs", "wrappers"},
     {"data"},
     {"gp"},

@@ -9,6 +9,7 @@ from torch import Tensor
 from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.data.standardised import Data
+from gym_dgpmpc.forks import compute_on_one_thread_in_children
 from gym_dgpmpc.types import ObservationSpec, Transitions
 
 Fitted = TypeVar("Fitted")
@@ -36,6 +37,7 @@ class Learner(Generic[Fitted]):
         self.encoder = Encoder(observation_size, action_size, observation_spec)
         self.dtype, self.device = dtype, torch.device(device)
         self._fitted: Fitted | None = None
+        compute_on_one_thread_in_children()
 
     def _encode(self, data: Transitions) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N T"]]:
         """Inputs and targets, in raw units and double precision.

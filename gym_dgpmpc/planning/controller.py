@@ -17,6 +17,7 @@ from gymnasium import spaces
 
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import PlanningError
+from gym_dgpmpc.forks import compute_on_one_thread_in_children
 from gym_dgpmpc.planning.plan_state import PlanState
 from gym_dgpmpc.planning.registry import action_bounds
 from gym_dgpmpc.planning.rollout import rollout_objective
@@ -85,6 +86,7 @@ class Controller:
         self.num_particles = num_particles
         self.actions_per_plan = actions_per_plan
         self.time_budget = time_budget
+        compute_on_one_thread_in_children()
 
     @property
     def num_particles(self) -> int:
