@@ -333,6 +333,15 @@ def run_wide(*arguments):
     return CliRunner().invoke(cli.app, [*arguments], env={"COLUMNS": "400"}).stdout
 
 
+def test_a_missing_extra_is_named(run, monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("gymnasium_robotics")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(sys.modules, "gym_dgpmpc.envs.robotics", raising=False)
+    monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)  # as if it was not installed
+    result = run("train", "gym_dgpmpc.envs.robotics:FetchReachDense-v4", "--no-video")
+    assert is_one_line_error(result, "module gymnasium_robotics:", 'pip install "gym-dgpmpc[robotics]"')
+
+
 def test_short_and_long_names_of_an_option_are_the_same(run):
     for layers in ("--layers", "--num-layers"):
         out = f"a{layers}"

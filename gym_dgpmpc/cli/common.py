@@ -10,6 +10,7 @@ import gymnasium
 import typer
 
 from gym_dgpmpc.errors import DGPMPCError
+from gym_dgpmpc.extras import how_to_install, missing_module
 
 EXIT_ERROR, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 130, 143
 
@@ -54,5 +55,6 @@ def make(env_id: str, *, render: bool) -> gymnasium.Env:
     try:
         return gymnasium.make(env_id, render_mode="rgb_array") if render else gymnasium.make(env_id)
     except ModuleNotFoundError as error:
-        module = error.name or env_id.partition(":")[0]
-        raise ValueError(f"the environment {env_id} needs the Python module {module}: install it") from error
+        module = missing_module(error) or env_id.partition(":")[0]
+        told = f"the environment {env_id} needs the Python module {module}: {how_to_install(module)}"
+        raise ValueError(told) from error

@@ -16,6 +16,8 @@ import numpy as np
 from numpy import ndarray
 from PIL import Image
 
+from gym_dgpmpc.extras import how_to_install
+
 MAX_FRAME_WIDTH = 480
 PROBE_SECONDS = 120
 HOW_TO_GET_OPENGL = (
@@ -49,6 +51,11 @@ def probe_rendering(env_id: str = "ModCartPole-v0") -> Rendering:
         reason = _try_to_draw(env_id, environment)
         if reason is None:
             return Rendering(True, backend)
+        missing = re.search(r"No module named '([\w.]+)'", reason)
+        if missing:  # which no other backend brings
+            module = missing[1]
+            told = f"{env_id} cannot be drawn without the Python module {module}: {how_to_install(module)}"
+            return Rendering(False, None, told)
         why_not.append(f"{backend or 'default'}: {reason}")
     return Rendering(False, None, f"{env_id} cannot be drawn here ({'; '.join(why_not)}); {HOW_TO_GET_OPENGL}")
 
@@ -101,7 +108,7 @@ def _try_to_draw(env_id: str, environment: dict[str, str]) -> str | None:
     if result.returncode == 0:
         return None
     # The first error in a chain is the cause; what follows it (a failing clean-up, say) is not.
-    errors = re.findall(r"^\S.*?(\w*Error\b.*)", "\n" + result.stderr, re.MULTILINE)
+    errors = re.findall(r"^(?:\S.*?\b)?(\w*Error\b.*)", result.stderr, re.MULTILINE)
     return (errors[0] if errors else f"exit status {result.returncode}")[:200]
 
 

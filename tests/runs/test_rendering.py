@@ -69,6 +69,15 @@ def test_why_nothing_can_be_drawn(monkeypatch):
     assert "\n" not in rendering.why_not
 
 
+def test_a_missing_module_is_named_with_its_extra(monkeypatch, tmp_path):
+    """Whatever OpenGL there is, Gymnasium draws the pendulum with pygame."""
+    (tmp_path / "pygame.py").write_text("""raise ModuleNotFoundError("No module named 'pygame'", name="pygame")""")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    rendering = probe_rendering("Pendulum-v1")
+    assert not rendering.possible
+    assert rendering.why_not.endswith('without the Python module pygame: pip install "gym-dgpmpc[classic]"')
+
+
 @pytest.mark.rendering
 def test_the_chosen_backend_works():
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}

@@ -138,7 +138,9 @@ def test_a_cache_that_cannot_be_used_is_done_without(failing, tmp_path, monkeypa
         monkeypatch.setattr(Path, "home", fail)
     elif failing == "write":
         keep = compiler._keep
-        monkeypatch.setattr(compiler, "_keep", lambda f, *rest: fail() if f.is_relative_to(tmp_path) else keep(f, *rest))
+        monkeypatch.setattr(
+            compiler, "_keep", lambda f, *rest: fail() if f.is_relative_to(tmp_path) else keep(f, *rest)
+        )
     else:
         monkeypatch.setattr(compiler.ctypes, "CDLL", refuse_the_cache)
     with warnings.catch_warnings():
