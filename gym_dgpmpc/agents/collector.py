@@ -92,6 +92,13 @@ class Collector:
         """Whether an episode of random actions has ended in any environment."""
         return any(running.has_explored for running in self.running)
 
+    @property
+    def num_given_up(self) -> int:
+        """How many episodes were begun anew before one ended, in the environments where none has ended yet."""
+        return min((running.index for running in self.running if not running.has_explored), default=0) // len(
+            self.running
+        )
+
     def begin_episode(self, index: int, number: int) -> None:
         """A new episode, with a cold plan, in the environment ``index``; ``number`` is what a log calls it."""
         running = self.running[index]

@@ -54,7 +54,7 @@ from gym_dgpmpc.planning.registry import planner_factory
 from gym_dgpmpc.randomness import Generators, fresh_seed, split_seed
 from gym_dgpmpc.settings import Setting, joined, settings_of
 from gym_dgpmpc.tasks.dict_observations import FlatDict, original_space
-from gym_dgpmpc.tasks.environment import flat_size, wrapped_env
+from gym_dgpmpc.tasks.environment import flat_size, time_limit, wrapped_env
 from gym_dgpmpc.tasks.exported import arrays, minari_dataset, replay_buffer
 from gym_dgpmpc.tasks.functions import Learned
 from gym_dgpmpc.tasks.logged import Logged, read_logged
@@ -76,6 +76,9 @@ SelfAgent = TypeVar("SelfAgent", bound="MPCAgent")
 
 ENDLESS = 1000
 """Random steps after which a warning says that no episode has ended. Gymnasium's own tasks have at most as many."""
+
+MANY_GIVEN_UP = 10
+"""Random episodes given up for new ones, after which a warning says that it may take long until something is learned."""
 
 
 class MPCAgent(BaseAlgorithm):
@@ -110,7 +113,7 @@ class MPCAgent(BaseAlgorithm):
         num_particles: worlds drawn for each plan, P, over which a return is averaged.
         actions_per_plan: actions performed of each plan before the next one is made.
         learning_starts: transitions before the first training, of random actions if they were not logged; default:
-            those of one episode in each environment, or ``train_freq`` if these come first.
+            those of one episode in each environment (or of several that were given up, up to its time limit), or ``train_freq`` if these come first.
         train_freq: environment steps between two trainings, for tasks that never end or whose episodes are very long
             or very short; default: one at every episode's start.
         time_budget: seconds that a plan may take, drawing its worlds included; the best plan found by then is used.
@@ -358,8 +361,16 @@ class MPCAgent(BaseAlgorithm):
         if self.learning_starts is None:
             # An episode that never ends must not put off the first training beyond the others.
             enough = self.train_freq is not None and len(self.store) >= self.train_freq
-            return not enough and not self.collector.all_explored
+            return not enough and not self.collector.all_explored and not self._has_explored_in_pieces
         return len(self.store) < self.learning_starts
+
+    @property
+    def _has_explored_in_pieces(self) -> bool:
+        """Whether there are as many steps as an episode may have, of episodes of which none was let end."""
+        if self.collector.num_given_up == 0:
+            return False
+        limit = time_limit(self.env)
+        return limit is not None and len(self.store) >= limit * self.n_envs
 
     @property
     def is_training_due(self) -> bool:
@@ -508,7 +519,9 @@ class MPCAgent(BaseAlgorithm):
             callback: SB3 callback(s), called after each step.
             log_interval: episodes between two writings of the log.
             tb_log_name: name of the run's folder under ``tensorboard_log``.
-            reset_num_timesteps: start counting from zero, with a new episode; a run that goes on never does.
+            reset_num_timesteps: start counting from zero, with a new episode; a run that goes on never does. Random
+                steps count all the same: calls that are shorter than the first episode end exploration once they are
+                as many steps as an episode may have; where the environment names no such limit, a warning says so.
             progress_bar: show one.
             run_folder: where to keep checkpoints, for this process alone.
             resume: go on from the checkpoint in ``run_folder``; without one the run begins.
@@ -649,6 +662,15 @@ class MPCAgent(BaseAlgorithm):
         return new_obs, rewards, dones, infos
 
     def _warn_of_an_endless_beginning(self) -> None:
+        if self.learning_starts is None and self.collector.num_given_up > 1:
+            limit = time_limit(self.env)
+            if limit is None or self.collector.num_given_up >= MANY_GIVEN_UP:
+                when = "one does" if limit is None else f"one does, or there are {limit * self.n_envs} random steps"
+                self._warn_once(
+                    "no episode has ended, because each call of learn begins a new one, and nothing is learned before "
+                    f"{when}: pass reset_num_timesteps=False to learn, which then goes on in the running episode, or "
+                    "learning_starts=... to the agent"
+                )
         is_late = len(self.store) == ENDLESS * self.n_envs and not self.collector.any_explored
         if self.learning_starts is None and is_late:
             self._warn_once(

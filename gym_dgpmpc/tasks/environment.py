@@ -114,6 +114,14 @@ def environment_id(env: VecEnv | None) -> str | None:
     return spec.id if package in ("gymnasium", "gym_dgpmpc", "__main__") else f"{module}:{spec.id}"
 
 
+def time_limit(env: VecEnv | None) -> int | None:
+    """Steps after which an episode is truncated, as far as the (first) environment says; else None."""
+    limit = offered_by(env, "_max_episode_steps")  # of Gymnasium's TimeLimit, be the environment registered or not
+    if limit is None:
+        limit = getattr(offered_by(env, "spec"), "max_episode_steps", None)
+    return int(limit) if isinstance(limit, int | np.integer) and limit > 0 else None
+
+
 def about_environment(env: VecEnv) -> dict[str, Any]:
     """What a file says of the environment, as plain values: its id, the parts of Dict observations, reset's options."""
     return {

@@ -1,8 +1,11 @@
 """Learning: what is stored, when the model is trained, what repeats, and what survives a failure."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
+from gymnasium.wrappers import TimeLimit
 
 from gym_dgpmpc import MPCAgent
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError, PlanningError
@@ -89,6 +92,37 @@ def test_learning_starts_counts_random_steps(learning_starts, first_fit):
     learner.learn(25)
     assert learner.dynamics.fits[0] == first_fit
     assert learner.dynamics.resamples == 25 - first_fit
+
+
+def test_calls_shorter_than_an_episode_train_once_they_are_as_long_together():
+    """Each begins a new episode, so that none ever ends."""
+    learner = agent(TimeLimit(KnownPointMass(), LENGTH))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(6):
+            learner.learn(4)
+    assert learner.dynamics.fits == [12, 16, 20]
+    assert len(actions_of(learner.env.envs[0])) == 24
+
+
+def test_calls_much_shorter_than_an_episode_say_so_before_it_is_long():
+    learner = agent(TimeLimit(KnownPointMass(), 500))
+    with pytest.warns(UserWarning, match=r"\b500 random steps") as warned:
+        for _ in range(15):
+            learner.learn(2)
+    assert len(warned) == 1
+
+
+def test_calls_shorter_than_an_episode_without_a_known_limit_say_so_once():
+    learner = agent()
+    with pytest.warns(UserWarning, match="reset_num_timesteps=False") as warned:
+        for _ in range(6):
+            learner.learn(4)
+    assert len(warned) == 1
+    assert learner.dynamics.fits == []
+    for _ in range(6):
+        learner.learn(4, reset_num_timesteps=False)
+    assert learner.dynamics.fits == [30, 40]
 
 
 def test_learning_again_keeps_the_data_and_does_not_explore_again():
