@@ -144,6 +144,21 @@ class DynamicsModel(Protocol):
     def load_state_dict(self, state: StateDict) -> None: ...
 
 
+ProgressFn = Callable[[int, int, float], None]
+"""(iterations done, of how many, the present loss): how far a training is. What a loss is, the model says."""
+
+
+@runtime_checkable
+class ReportsProgress(Protocol):
+    """A `DynamicsModel` that says now and then, while `fit` runs, how far it is; other models need not.
+
+    Attributes:
+        on_progress: what is called; None for nothing. An agent sets it while it trains.
+    """
+
+    on_progress: ProgressFn | None
+
+
 DynamicsFactory = Callable[[int, int, ObservationSpec], DynamicsModel]
 """(observation size, action size, how to read the observation) -> an untrained model of such transitions."""
 

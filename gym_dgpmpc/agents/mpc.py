@@ -25,6 +25,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 from stable_baselines3.common.vec_env import VecEnv
 
+from gym_dgpmpc.agents.bars import Bars
 from gym_dgpmpc.agents.collector import Collector
 from gym_dgpmpc.agents.composition import (
     AnyPlanner,
@@ -78,7 +79,7 @@ ENDLESS = 1000
 """Random steps after which a warning says that no episode has ended. Gymnasium's own tasks have at most as many."""
 
 MANY_GIVEN_UP = 10
-"""Random episodes given up for new ones, after which a warning says that it may take long until something is learned."""
+"""Random episodes given up for new ones, after which a warning says that it may take long until anything is learned."""
 
 
 class MPCAgent(BaseAlgorithm):
@@ -113,7 +114,8 @@ class MPCAgent(BaseAlgorithm):
         num_particles: worlds drawn for each plan, P, over which a return is averaged.
         actions_per_plan: actions performed of each plan before the next one is made.
         learning_starts: transitions before the first training, of random actions if they were not logged; default:
-            those of one episode in each environment (or of several that were given up, up to its time limit), or ``train_freq`` if these come first.
+            those of one episode in each environment (as many in all, if none is let end), or ``train_freq`` if these
+            come first.
         train_freq: environment steps between two trainings, for tasks that never end or whose episodes are very long
             or very short; default: one at every episode's start.
         time_budget: seconds that a plan may take, drawing its worlds included; the best plan found by then is used.
@@ -254,6 +256,7 @@ class MPCAgent(BaseAlgorithm):
         self.logs = Logs(self)
         self.policy = MPCPolicy(self.observation_space, self.action_space, self)
         self._training_context: Callable[[], AbstractContextManager[None]] = nullcontext
+        self._bars = Bars(False)
         self._has_described = False  # whether it was said where reward and termination come from
         self._warned: set[str] = set()
 
@@ -522,7 +525,7 @@ class MPCAgent(BaseAlgorithm):
             reset_num_timesteps: start counting from zero, with a new episode; a run that goes on never does. Random
                 steps count all the same: calls that are shorter than the first episode end exploration once they are
                 as many steps as an episode may have; where the environment names no such limit, a warning says so.
-            progress_bar: show one.
+            progress_bar: show one on the terminal, and one for each training that takes more than a second.
             run_folder: where to keep checkpoints, for this process alone.
             resume: go on from the checkpoint in ``run_folder``; without one the run begins.
             checkpoint_every: environment steps between checkpoints within an episode, beside those at its end: what a
@@ -541,15 +544,19 @@ class MPCAgent(BaseAlgorithm):
         """
         if self.env is None:
             raise ValueError("the agent has no environment to learn in: pass env=... to load, or call set_env(env)")
-        with safeguard(self, run_folder, resume=resume, checkpoint_every=checkpoint_every) as guard:
+        with (
+            safeguard(self, run_folder, resume=resume, checkpoint_every=checkpoint_every) as guard,
+            Bars(progress_bar) as self._bars,
+        ):
             if guard.goes_on:
                 total_timesteps -= self.num_timesteps if resume else 0
                 reset_num_timesteps = False
             total_timesteps, callback = self._begin(
-                guard, max(total_timesteps, 0), callback, reset_num_timesteps, tb_log_name, progress_bar
+                guard, max(total_timesteps, 0), callback, reset_num_timesteps, tb_log_name
             )
             self._training_context = guard.training
             callback.on_training_start(locals(), globals())
+            self._bars.begin(total_timesteps - self.num_timesteps)
             try:
                 self._control(total_timesteps, callback, log_interval)
             finally:
@@ -564,7 +571,6 @@ class MPCAgent(BaseAlgorithm):
         callback: MaybeCallback,
         reset_num_timesteps: bool,
         tb_log_name: str,
-        progress_bar: bool,
     ) -> tuple[int, BaseCallback]:
         """SB3's `_setup_learn`, with the guard's first checkpoint before there is a logger."""
         if not reset_num_timesteps:
@@ -584,7 +590,7 @@ class MPCAgent(BaseAlgorithm):
             self._has_described = True
         # Callbacks come last, for they may use the logger as soon as they are given the agent; the guard's after the
         # user's, so that a checkpoint holds what they did.
-        return total_timesteps, self._init_callback([*_as_callbacks(callback), guard.callback()], progress_bar)
+        return total_timesteps, self._init_callback([*_as_callbacks(callback), guard.callback()])
 
     def _control(self, total_timesteps: int, callback: BaseCallback, log_interval: int) -> None:
         """Algorithm 2 of the paper, one pass through the loop per control step (of all environments)."""
@@ -605,6 +611,7 @@ class MPCAgent(BaseAlgorithm):
 
             # Perform the first action of the sequence, append the observed tuple to the data set.
             new_obs, rewards, dones, infos = self._perform(observations, actions)
+            self._bars.step(self.n_envs)
 
             # Re-sample the inducing outputs U.
             if self.is_fitted:
@@ -702,9 +709,11 @@ class MPCAgent(BaseAlgorithm):
         if task.learns_termination and not task.modelled.terminated and self.store.terminated.any():
             self._model_anew(reward=task.modelled.reward, terminated=True)
         started = time.perf_counter()
-        with self._training_context():
+        with self._training_context(), self._bars.training(self.dynamics) as losses:
             metrics = dict(self.dynamics.fit(task.transitions(self.store), self.generators.fit))
         self.num_fitted = len(self.store)
+        if losses:
+            metrics |= {"first_loss": losses[0], "last_loss": losses[-1]}
         metrics |= {"num_transitions": self.num_fitted, "seconds": time.perf_counter() - started}
         for name, value in metrics.items():
             self.logger.record(f"train/{name}", value)

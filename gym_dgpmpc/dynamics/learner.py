@@ -10,7 +10,7 @@ from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.forks import compute_on_one_thread_in_children
-from gym_dgpmpc.types import ObservationSpec, Transitions
+from gym_dgpmpc.types import ObservationSpec, ProgressFn, Transitions
 
 Fitted = TypeVar("Fitted")
 
@@ -24,6 +24,9 @@ class Learner(Generic[Fitted]):
         observation_spec: how to read the observation.
         dtype: precision of rollouts.
         device: where tensors live.
+
+    Attributes:
+        on_progress: see `ReportsProgress`.
     """
 
     def __init__(
@@ -37,6 +40,7 @@ class Learner(Generic[Fitted]):
         self.encoder = Encoder(observation_size, action_size, observation_spec)
         self.dtype, self.device = dtype, torch.device(device)
         self._fitted: Fitted | None = None
+        self.on_progress: ProgressFn | None = None
         compute_on_one_thread_in_children()
 
     def _encode(self, data: Transitions) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N T"]]:

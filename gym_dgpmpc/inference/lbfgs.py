@@ -8,12 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.gp.deep_gp import DeepGP
 from gym_dgpmpc.gp.layer import Layer
 from gym_dgpmpc.gp.sgpr import collapsed_bound
+from gym_dgpmpc.types import ProgressFn
 
 LENGTHSCALES, VARIANCES, NOISE_VARIANCES = (0.01, 1e3), (1e-4, 1e4), (1e-6, 10.0)
 """Limits of the hyperparameters, for standardised data: beyond them factorisations fail and the bound gains nothing."""
@@ -27,13 +28,21 @@ class Maximum(NamedTuple):
     num_evaluations: int
 
 
-def maximise_bound(model: DeepGP, data: Data, max_iterations: int, *, free_inducing_inputs: bool = True) -> Maximum:
+def maximise_bound(
+    model: DeepGP,
+    data: Data,
+    max_iterations: int,
+    *,
+    free_inducing_inputs: bool = True,
+    on_progress: ProgressFn | None = None,
+) -> Maximum:
     """Climb the collapsed bound from ``model``, which has one layer.
 
     Args:
         data: standardised.
         max_iterations: iterations of L-BFGS; each takes about one evaluation of the bound and its gradient.
         free_inducing_inputs: move the inducing inputs too, instead of the hyperparameters alone.
+        on_progress: is told after every iteration how many there were, of how many at most, and the negative bound.
     """
     (layer,) = model.layers
     start = [layer.log_lengthscale, layer.log_variance.unsqueeze(0), model.log_noise]
@@ -61,6 +70,13 @@ def maximise_bound(model: DeepGP, data: Data, max_iterations: int, *, free_induc
             (gradient,) = torch.autograd.grad(value, position)
         return value.item(), gradient.cpu().numpy()
 
+    losses: list[float] = []  # one per iteration
+
+    def report(intermediate_result: OptimizeResult) -> None:
+        losses.append(float(intermediate_result.fun))
+        if on_progress is not None:
+            on_progress(len(losses), max_iterations, losses[-1])
+
     low, high = np.array(boxes).T
     found = minimize(
         negative_bound,
@@ -68,6 +84,7 @@ def maximise_bound(model: DeepGP, data: Data, max_iterations: int, *, free_induc
         jac=True,
         method="L-BFGS-B",
         bounds=boxes,
+        callback=report,
         options={"maxiter": max_iterations},
     )
     return Maximum(unpack(torch.from_numpy(found.x).to(data.x)), -float(found.fun), int(found.nfev))

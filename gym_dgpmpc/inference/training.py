@@ -5,6 +5,7 @@ size. If the likelihood of held-out data no longer improves, it stops. `dynamics
 """
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -69,6 +70,7 @@ def train(
     num_iterations: int,
     generator: torch.Generator,
     settings: InferenceSettings,
+    on_look: Callable[[int, float], None] | None = None,
 ) -> Trained:
     """Train for ``num_iterations`` iterations at most.
 
@@ -76,6 +78,7 @@ def train(
         model: hyperparameters to start from; left as they are.
         chain: where to start; its preconditioner is kept.
         data: standardised; with early stopping a tenth of it serves to see when to stop.
+        on_look: is told the iterations done and the negative log joint, at the start and at every look.
 
     Raises:
         TrainingError: training diverged again and again, with ever smaller steps.
@@ -86,6 +89,8 @@ def train(
     run = MCEM(model, chain, data, settings)
     good, best, rollbacks = run.snapshot(), run.evaluate(_copy_of(generator)), 0
     best_likelihood, looks_since = -math.inf, 0
+    if on_look is not None:
+        on_look(0, best)
     while run.iteration < num_iterations:
         trouble = _advance(run, min(settings.look_every, num_iterations - run.iteration), generator, best)
         if trouble is not None:
@@ -99,6 +104,8 @@ def train(
             run.restore(good, scale=0.5)
             continue
         good, best = run.snapshot(), min(best, float(run.value))
+        if on_look is not None:
+            on_look(run.iteration, float(run.value))
         if held_out is not None:
             positions = _draw_positions(run.window, generator)
             likelihood = predictive_log_likelihood(factorise_all(run.model), positions, held_out, generator)
@@ -118,10 +125,12 @@ def sample_pool(
     spacing: int,
     generator: torch.Generator,
     settings: InferenceSettings,
+    on_sample: Callable[[int], None] | None = None,
 ) -> Sampled:
     """Posterior samples ``spacing`` steps apart.
 
-    Begins anew with half the step size if the chain leaves what is plausible.
+    Begins anew with half the step size if the chain leaves what is plausible. After each sample ``on_sample`` is told
+    how many there are.
 
     Raises:
         TrainingError: it did so again and again, with ever smaller steps.
@@ -132,6 +141,8 @@ def sample_pool(
         with suppress(FactorisationError):  # in an exact draw: the steps before it left values that are not finite
             for last in mcem.sample(factorised, chain, data, num_samples, spacing, generator, settings):
                 positions.append(last.position)
+                if on_sample is not None:
+                    on_sample(len(positions))
         if len(positions) == num_samples and is_plausible(pool := torch.stack(positions)):
             return Sampled(pool, last, settings.step_size)
         settings = replace(settings, step_size=0.5 * settings.step_size)

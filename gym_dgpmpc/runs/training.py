@@ -110,7 +110,7 @@ class TrainingRun:
                 callback,
                 tb_log_name=LOG_NAME,
                 reset_num_timesteps=not self.folder.checkpoints.exist,
-                progress_bar=progress_bar and steps_of_call > 0,
+                progress_bar=progress_bar,
                 run_folder=self.folder.checkpoints,
                 checkpoint_every=self.checkpoint_every,
             )

@@ -330,3 +330,19 @@ def test_the_expectation_is_the_mean_and_every_particle_the_same():
 def test_with_one_member_it_does_not_matter_when_it_is_chosen():
     every_step, once = (linear_ensemble(draw, num_members=1) for draw in ("TS1", "TSinf"))
     assert torch.equal(states_of(every_step, num_particles=7), states_of(once, num_particles=7))
+
+
+def test_a_training_that_says_how_far_it_is_is_the_same(learner):
+    silent, told = CASES[learner].make(), CASES[learner].make()
+    heard = []
+    told.on_progress = lambda *progress: heard.append(progress)
+    data = slider.transitions(NUM_DATA, NOISE)
+    generators = seeded(), seeded()
+    metrics = [model.fit(data, generator) for model, generator in zip((silent, told), generators, strict=True)]
+    assert metrics[0] == metrics[1]
+    assert torch.equal(generators[0].get_state(), generators[1].get_state())
+    done, totals, losses = zip(*heard, strict=True)
+    assert list(done) == sorted(done)
+    assert done[-1] <= totals[-1]
+    assert set(totals) == {totals[0]}
+    assert np.isfinite(losses).all()

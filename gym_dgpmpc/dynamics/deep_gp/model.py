@@ -186,7 +186,16 @@ class DeepGPDynamics(Learner[_Fitted]):
             model, whitened = restandardise(last.factorised.model, last.chain.position, last.normalisers, normalisers)
             if self.relocate:
                 model, whitened = relocate(model, whitened, standardised, generator)
-        trained = training.train(model, sghmc.init(whitened), standardised, iterations, generator, self.inference)
+        total, report = iterations + self.num_samples * self.sample_spacing, self.on_progress or _report_nothing
+        trained = training.train(
+            model,
+            sghmc.init(whitened),
+            standardised,
+            iterations,
+            generator,
+            self.inference,
+            lambda done, loss: report(done, total, loss),
+        )
         factorised = factorise_all(trained.model)
         sampled = training.sample_pool(
             factorised,
@@ -196,6 +205,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             self.sample_spacing,
             generator,
             trained.settings,
+            lambda count: report(iterations + count * self.sample_spacing, total, trained.negative_log_joint),
         )
         self._fitted = _Fitted(factorised, normalisers, sampled.chain, sampled.pool, 0, sampled.step_size)
         counts = {"iterations": float(trained.num_iterations), "rollbacks": float(trained.num_rollbacks)}
@@ -327,3 +337,7 @@ class DeepGPDynamics(Learner[_Fitted]):
         for index, layer in enumerate(model.layers):
             metrics[f"layer_{index + 1}_kernel_std"] = float(layer.variance.sqrt())
         return metrics
+
+
+def _report_nothing(done: int, total: int, loss: float) -> None:
+    """In place of ``on_progress`` where nobody listens."""

@@ -243,7 +243,7 @@ class EnsembleDynamics(Learner[_Fitted]):
                 "step": torch.tensor(float(num_updates)), "exp_avg": first, "exp_avg_sq": second,
             }  # fmt: skip
         rows = torch.randint(len(x), (self.num_members, len(x)), generator=generator, device=x.device)
-        for _ in range(self.num_epochs):
+        for epoch in range(self.num_epochs):
             order = torch.rand(rows.shape, generator=generator, device=x.device).argsort(1)
             losses = []
             for batch in rows.gather(1, order).split(self.batch_size, dim=1):
@@ -254,6 +254,8 @@ class EnsembleDynamics(Learner[_Fitted]):
                 adam.step()
                 losses.append(value.detach())
                 num_updates += 1
+            if self.on_progress is not None:
+                self.on_progress(epoch + 1, self.num_epochs, float(torch.stack(losses).mean()))
         trained = Ensemble.from_parameters({name: value.detach() for name, value in parameters.items()})
         moments = {
             name: _Moments(adam.state[value]["exp_avg"], adam.state[value]["exp_avg_sq"])

@@ -112,7 +112,13 @@ class SparseGPDynamics(Learner[_Fitted]):
         """
         normalisers, standardised = self._standardised(data)
         start = self._start(standardised, normalisers, generator)
-        found = maximise_bound(start, standardised, self.max_training_iterations, free_inducing_inputs=not self.exact)
+        found = maximise_bound(
+            start,
+            standardised,
+            self.max_training_iterations,
+            free_inducing_inputs=not self.exact,
+            on_progress=self.on_progress,
+        )
         self._condition(found.model, normalisers, standardised)
         return {
             "bound": found.bound,
