@@ -101,7 +101,7 @@ def test_calls_shorter_than_an_episode_train_once_they_are_as_long_together():
         warnings.simplefilter("error")
         for _ in range(6):
             learner.learn(4)
-    assert learner.dynamics.fits == [12, 16, 20]
+    assert learner.dynamics.fits == [LENGTH, 12, 16, 20]
     assert len(actions_of(learner.env.envs[0])) == 24
 
 
