@@ -53,6 +53,7 @@ from gym_dgpmpc.planning.plan_state import PackedPlans
 from gym_dgpmpc.planning.registry import planner_factory
 from gym_dgpmpc.randomness import Generators, fresh_seed, split_seed
 from gym_dgpmpc.settings import Setting, joined, settings_of
+from gym_dgpmpc.tasks.borders import received_batch
 from gym_dgpmpc.tasks.dict_observations import FlatDict, original_space
 from gym_dgpmpc.tasks.environment import flat_size, wrapped_env
 from gym_dgpmpc.tasks.exported import arrays, minari_dataset, replay_buffer
@@ -562,6 +563,8 @@ class MPCAgent(BaseAlgorithm):
             total_timesteps, _ = self._setup_learn(total_timesteps, None, reset_num_timesteps, tb_log_name)
         finally:
             self._custom_logger = not makes_logger
+        started, self._last_obs = self._observations, None
+        self._last_obs = received_batch(started, (self.n_envs, *self.observation_space.shape), "reset")
         guard.begin(tb_log_name)
         if makes_logger:
             self._logger = self.logs.open(tb_log_name, begin_anew=reset_num_timesteps, in_run=guard.is_on)
@@ -635,12 +638,12 @@ class MPCAgent(BaseAlgorithm):
             new_obs, rewards, dones, infos, terminated = self.collector.step(
                 self.env, observations, actions, self.num_timesteps
             )
-        except EnvironmentFailedError:
+        except (EnvironmentFailedError, EnvironmentDataError):
             self._episode_num += len(self.store) > before  # the step ended the episode, and the reset after it failed
             raise
         finally:
             self.num_timesteps += len(self.store) - before
-        self._last_obs, self._last_episode_starts = new_obs, dones
+        self._last_obs, self._last_episode_starts = new_obs.copy(), dones.copy()  # callbacks are given the others
         if terminated.any() and self.task.functions.terminated_fn is None and not self.task.learns_termination:
             self._warn_once(
                 "the environment ended an episode by termination, which the planner knows nothing of: pass "

@@ -12,6 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
+from gym_dgpmpc.tasks.borders import guard
 from gym_dgpmpc.tasks.dict_observations import flattened, layout
 from gym_dgpmpc.tasks.replay import options_to_reset, remember_starts
 
@@ -28,6 +29,7 @@ def wrapped_env(env: GymEnv | str) -> VecEnv:
     _refuse_no_environment(env)
     vec_env = flattened(BaseAlgorithm._wrap_env(maybe_make_env(env, 0)))
     check_env(vec_env)
+    guard(vec_env)
     remember_starts(vec_env)
     return vec_env
 

@@ -190,7 +190,7 @@ def replay(
     observation: Any = None
     shape = vec_env.action_space.shape or ()
     for step, action in enumerate(actions):
-        observation, reward, dones, _ = vec_env.step(action.reshape(1, *shape))
+        observation, reward, dones, _ = vec_env.step(action.reshape(1, *shape).copy())
         if dones[0]:
             return f"the episode ended at its step {step}"
         if not np.array_equal(np.asarray(observation[0], dtype=np.float32), next_observations[step]):
