@@ -57,7 +57,7 @@ from gym_dgpmpc.tasks.borders import received_batch
 from gym_dgpmpc.tasks.dict_observations import FlatDict, original_space
 from gym_dgpmpc.tasks.environment import flat_size, wrapped_env
 from gym_dgpmpc.tasks.exported import arrays, minari_dataset, replay_buffer
-from gym_dgpmpc.tasks.functions import Learned
+from gym_dgpmpc.tasks.functions import Learned, Never
 from gym_dgpmpc.tasks.logged import Logged, read_logged
 from gym_dgpmpc.tasks.reward_guard import disagreements
 from gym_dgpmpc.tasks.task import Task, TaskArguments
@@ -105,7 +105,7 @@ class MPCAgent(BaseAlgorithm):
             predicts it.
         terminated_fn: whether an episode ends in s', batched likewise. None: the environment's ``terminated_fn`` (which
             may be None: never), or what is known; if there is none, or with "learned", the model predicts it from the
-            first termination on.
+            first termination on. "never": episodes are planned as if they did not end.
         observation_spec: how the model reads observations; default: the environment's ``observation_spec``, or what is
             known. For Dict observations it indexes the vector of the parts in alphabetical order.
         num_particles: P, worlds drawn for each plan.
@@ -165,7 +165,7 @@ class MPCAgent(BaseAlgorithm):
         dynamics: DynamicsModel | DynamicsFactory | None = None,
         planner: str | PlannerFactory | Planner | None = None,
         reward_fn: RewardFn | Learned | None = None,
-        terminated_fn: TerminatedFn | Learned | None = None,
+        terminated_fn: TerminatedFn | Learned | Never | None = None,
         observation_spec: ObservationSpec | None = None,
         num_particles: int = 5,
         actions_per_plan: int = 1,

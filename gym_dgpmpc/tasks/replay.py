@@ -95,7 +95,7 @@ def can_replay(start: EpisodeStart) -> bool:
     this package.
     """
     if start.has_wrapper_attr("can_replay"):
-        return bool(start.get_wrapper_attr("can_replay"))
+        return start.get_wrapper_attr("can_replay") is True  # another package's method of that name says nothing
     classes = type(start.unwrapped).__mro__
     return type(start.unwrapped).__module__.startswith(SIMULATORS) or any(
         each.__module__ == "gymnasium.envs.mujoco.mujoco_env" for each in classes

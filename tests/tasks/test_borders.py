@@ -187,6 +187,7 @@ def test_callbacks_may_write_into_what_they_are_given():
     def spoil(locals_, globals_):
         for name in ("new_obs", "rewards", "actions", "dones"):
             locals_[name].fill(0)
+        return True
 
     expected, found = (agent(learning_starts=1000).learn(25, callback=each).store for each in (None, spoil))
     for name, column in expected.state_dict().items():
