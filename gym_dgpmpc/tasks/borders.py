@@ -112,7 +112,7 @@ def terminal_observation(info: Mapping[str, Any], shape: tuple[int, ...]) -> Flo
 
 def _copied(value: Any, shape: tuple[int, ...], what: str) -> ndarray:
     try:
-        array = np.array(value)
+        array = np.asarray(value).copy()
     except Exception as error:  # a ragged list, a tensor that requires a gradient
         raise EnvironmentDataError(f"{what} that cannot be made an array: {value!r} ({error})") from error
     if array.dtype.kind not in "fiub":

@@ -7,13 +7,14 @@ known of its class, or to be learned.
 import inspect
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 import torch
 from gymnasium import spaces
+from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
 from gym_dgpmpc.envs import known
@@ -167,7 +168,12 @@ def _of_chosen_actions(env: VecEnv | None, reward_fn: RewardFn) -> RewardFn:
     if spec is None or all(wrapper.entry_point == known.MONITOR for wrapper in spec.additional_wrappers):
         return reward_fn
     made = known.made_from(spec)
-    if made is None:
+    if made is None:  # a wrapper does not record how it was made
+        for wrapper in spec.additional_wrappers:
+            with suppress(ImportError, AttributeError):  # of a class within a function nothing is known
+                maker: Any = load_env_creator(wrapper.entry_point)
+                if isinstance(maker, type) and issubclass(maker, gym.ActionWrapper):
+                    raise ChangingActionsError(wrapper.name)
         return reward_fn
     try:
         return known.offered_reward(made, reward_fn)

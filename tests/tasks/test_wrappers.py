@@ -176,6 +176,17 @@ def test_in_another_process_the_wrappers_are_those_of_the_spec(env_id):
         env.close()
 
 
+def test_in_another_process_a_wrapper_that_does_not_record_how_it_was_made_is_refused():
+    env = make_vec_env(
+        "ModCartPole-v0", vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"}, wrapper_class=Halved
+    )
+    try:
+        with pytest.raises(ValueError, match="Halved around it may perform other actions"):
+            found(env)
+    finally:
+        env.close()
+
+
 def test_a_risk_sensitive_reward_follows_actions_too():
     env = wrappers.RescaleAction(gym.make("ModCartPole-v0"), -0.5, 0.5)
     learner = mpc(RiskSensitiveReward(env, angle_index=1, penalise_step=True), learning_starts=1000).learn(20)
