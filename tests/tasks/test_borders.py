@@ -157,6 +157,8 @@ def test_in_another_process_shared_arrays_are_warned_of():
 class Spoiling(VecEnvWrapper):
     """Writes into the actions, and hands out one array of observations and one of rewards again and again."""
 
+    keeps_actions = True
+
     def __init__(self, venv):
         super().__init__(venv)
         self.obs, self.rewards = np.zeros((venv.num_envs, 2)), np.zeros(venv.num_envs, dtype=np.float32)
