@@ -20,6 +20,7 @@ from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.plan_state import AGE, PlanState, plans_from_tensors, plans_to_tensors
+from gym_dgpmpc.tasks.borders import received_batch, terminal_observation, warn_of_shared_memory
 from gym_dgpmpc.tasks.dict_observations import flatten
 from gym_dgpmpc.tasks.logged import LoggedRows
 from gym_dgpmpc.tasks.replay import episode_start
@@ -65,6 +66,7 @@ class Collector:
     def __init__(self, store: TransitionStore, num_envs: int, controller: Controller):
         self.store, self._controller = store, controller
         self.running = self._new_episodes(num_envs)
+        self._has_warned = False
 
     def _new_episodes(self, num_envs: int, *, has_explored: bool = False) -> list[RunningEpisode]:
         cold, horizon = self._controller.cold, self._controller.horizon
@@ -137,29 +139,35 @@ class Collector:
 
         Raises:
             EnvironmentFailedError: an environment raised an exception, which is the cause.
-            EnvironmentDataError: it returned something that is not finite; nothing is stored.
+            EnvironmentDataError: it returned something that is not finite or has another shape; the step is not
+                stored, unless it ended an episode and it is the reset after it that did so.
         """
         start = episode_start(env)
         if start is not None:
             start.last_step = None
         try:
-            new_obs, rewards, dones, infos = env.step(actions.reshape(-1, *(env.action_space.shape or ())))
+            # The environments may write into what they are given.
+            new_obs, rewards, dones, infos = env.step(actions.reshape(-1, *(env.action_space.shape or ())).copy())
+        except EnvironmentDataError as error:
+            self._keep_last_step(env, observations, actions)
+            raise EnvironmentDataError(f"step {number}: {error}") from error
         except Exception as error:
             self._keep_last_step(env, observations, actions)
             has_name = isinstance(error, EnvironmentFailedError)
             what = str(error) if has_name else f"the environment raised {type(error).__name__}: {error}"
             raise EnvironmentFailedError(f"step {number}: {what}") from (error.__cause__ if has_name else error)
-        assert isinstance(new_obs, ndarray)
+        new_obs = received_batch(new_obs, observations.shape, "step")
         # At an episode's end the environment has been reset already, and the true next observation is set aside.
         after, terminated = new_obs.copy(), dones.copy()
         for index in np.flatnonzero(dones):
-            after[index] = infos[index]["terminal_observation"]
+            after[index] = terminal_observation(infos[index], after[index].shape)
             terminated[index] = not infos[index].get("TimeLimit.truncated", False)
+        self._has_warned = self._has_warned or warn_of_shared_memory(env, new_obs, after, dones)
         normalize = unwrap_vec_normalize(env)
         if normalize is not None:
             rewards = normalize.get_original_reward()
         self._append(observations, actions, after, rewards, terminated)
-        return Step(new_obs, rewards, dones, list(infos), terminated)
+        return Step(new_obs, np.array(rewards), np.array(dones), list(infos), terminated)
 
     def _append(
         self, observations: ndarray, actions: ndarray, after: ndarray, rewards: ndarray, terminated: ndarray

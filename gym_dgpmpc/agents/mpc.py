@@ -54,10 +54,11 @@ from gym_dgpmpc.planning.plan_state import PackedPlans
 from gym_dgpmpc.planning.registry import planner_factory
 from gym_dgpmpc.randomness import Generators, fresh_seed, split_seed
 from gym_dgpmpc.settings import Setting, joined, settings_of
+from gym_dgpmpc.tasks.borders import received_batch
 from gym_dgpmpc.tasks.dict_observations import FlatDict, original_space
 from gym_dgpmpc.tasks.environment import flat_size, time_limit, wrapped_env
 from gym_dgpmpc.tasks.exported import arrays, minari_dataset, replay_buffer
-from gym_dgpmpc.tasks.functions import Learned
+from gym_dgpmpc.tasks.functions import Learned, Never
 from gym_dgpmpc.tasks.logged import Logged, read_logged
 from gym_dgpmpc.tasks.reward_guard import disagreements
 from gym_dgpmpc.tasks.task import Task, TaskArguments
@@ -108,7 +109,7 @@ class MPCAgent(BaseAlgorithm):
             predicts it.
         terminated_fn: whether an episode ends in s', batched likewise. None: the environment's ``terminated_fn`` (which
             may be None: never), or what is known; if there is none, or with "learned", the model predicts it from the
-            first termination on.
+            first termination on. "never": episodes are planned as if they did not end.
         observation_spec: how the model reads observations; default: the environment's ``observation_spec``, or what is
             known. For Dict observations it indexes the vector of the parts in alphabetical order.
         num_particles: worlds drawn for each plan, P, over which a return is averaged.
@@ -169,7 +170,7 @@ class MPCAgent(BaseAlgorithm):
         dynamics: DynamicsModel | DynamicsFactory | None = None,
         planner: str | PlannerFactory | Planner | None = None,
         reward_fn: RewardFn | Learned | None = None,
-        terminated_fn: TerminatedFn | Learned | None = None,
+        terminated_fn: TerminatedFn | Learned | Never | None = None,
         observation_spec: ObservationSpec | None = None,
         num_particles: int = 5,
         actions_per_plan: int = 1,
@@ -581,6 +582,8 @@ class MPCAgent(BaseAlgorithm):
             total_timesteps, _ = self._setup_learn(total_timesteps, None, reset_num_timesteps, tb_log_name)
         finally:
             self._custom_logger = not makes_logger
+        started, self._last_obs = self._observations, None
+        self._last_obs = received_batch(started, (self.n_envs, *self.observation_space.shape), "reset")
         guard.begin(tb_log_name)
         if makes_logger:
             self._logger = self.logs.open(tb_log_name, begin_anew=reset_num_timesteps, in_run=guard.is_on)
@@ -655,12 +658,12 @@ class MPCAgent(BaseAlgorithm):
             new_obs, rewards, dones, infos, terminated = self.collector.step(
                 self.env, observations, actions, self.num_timesteps
             )
-        except EnvironmentFailedError:
+        except (EnvironmentFailedError, EnvironmentDataError):
             self._episode_num += len(self.store) > before  # the step ended the episode, and the reset after it failed
             raise
         finally:
             self.num_timesteps += len(self.store) - before
-        self._last_obs, self._last_episode_starts = new_obs, dones
+        self._last_obs, self._last_episode_starts = new_obs.copy(), dones.copy()  # callbacks are given the others
         if terminated.any() and self.task.functions.terminated_fn is None and not self.task.learns_termination:
             self._warn_once(
                 "the environment ended an episode by termination, which the planner knows nothing of: pass "

@@ -105,7 +105,7 @@ class MPCPolicy(BasePolicy):
                 "(observation, info), of which the first is meant"
             )
         check_parts(observation, layout(self._agent.env))
-        array = np.asarray(flatten(observation), dtype=np.float32)
+        array = np.array(flatten(observation), dtype=np.float32)
         size = flat_size(self.observation_space)
         if array.ndim not in (1, 2) or array.shape[-1] != size:
             raise ValueError(f"expected an observation of shape ({size},) or (n, {size}), got {array.shape}")

@@ -17,7 +17,7 @@ from gym_dgpmpc.agents import DGPMPCAgent, presets
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.planning.registry import PLANNERS, planner_factory
 from gym_dgpmpc.settings import Setting, settings_of
-from gym_dgpmpc.tasks.functions import LEARNED
+from gym_dgpmpc.tasks.functions import LEARNED, NEVER
 
 SET_BY_THE_RUN = {"seed", "verbose", "tensorboard_log", "stats_window_size", "observation_spec"}
 """Settings of the agent that are not options: the run has them, or they are not plain values."""
@@ -25,7 +25,7 @@ SET_BY_THE_RUN = {"seed", "verbose", "tensorboard_log", "stats_window_size", "ob
 PLANNER_TEXT = "Planner, which optimises action sequences."
 SOURCE_TEXTS = {
     "reward_fn": "Let the model learn the reward, even where it is known.",
-    "terminated_fn": "Let the model learn when an episode ends, even where it is known.",
+    "terminated_fn": "Let the model learn when an episode ends, even where it is known; or plan as if none did.",
 }
 CHOICES = {"kernel": tuple(KERNELS)}
 """The values of settings whose annotation does not list them."""
@@ -62,7 +62,8 @@ def _options() -> Iterable[inspect.Parameter]:
                 seen.add(setting.name)
                 yield _option(setting.name, kind, setting.text, _default_text(setting), panel)
     for name, text in SOURCE_TEXTS.items():
-        yield _option(name, _choice(name, (LEARNED,)), text, "what is known; else learned", "Task")
+        choices = (LEARNED, NEVER) if name == "terminated_fn" else (LEARNED,)
+        yield _option(name, _choice(name, choices), text, "what is known; else learned", "Task")
 
 
 _PLANNING = ("num_particles", "actions_per_plan", "time_budget")

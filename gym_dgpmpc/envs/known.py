@@ -16,6 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.monitor import Monitor
 
 from gym_dgpmpc.envs import known_rewards as known
+from gym_dgpmpc.envs.performed_actions import ChangingActionsError, layers_above, of_chosen, only_maps_actions
 from gym_dgpmpc.types import ObservationSpec, RewardFn, TerminatedFn
 
 HARMLESS_WRAPPERS = (
@@ -39,6 +40,9 @@ OBSERVATION_KEEPERS = (
 )
 """Wrappers that change actions, rewards or the precision alone."""
 
+ACTION_KEEPERS = (gym.ObservationWrapper, gym.RewardWrapper, wrappers.FrameStackObservation, wrappers.NormalizeReward)
+"""Wrappers that change observations or rewards alone."""
+
 
 MONITOR = f"{Monitor.__module__}:{Monitor.__qualname__}"
 
@@ -61,32 +65,72 @@ def find(env: gym.Env | EnvSpec) -> KnownTask | None:
 
     Nothing is known about an environment whose class is only derived from one of these, whose MuJoCo model was replaced
     (``xml_file``), or that stands under a wrapper that may change what its numbers mean: any that has a `step` of its
-    own, but for `HARMLESS_WRAPPERS` and those that have an attribute ``keeps_task = True``.
+    own, but for `HARMLESS_WRAPPERS` and those that have an attribute ``keeps_task = True``. Action wrappers leave
+    termination and observations as they are, and the reward is that of the action that they perform; where that is not
+    a function of the chosen one, the reward is not known.
 
     Args:
         env: the environment with its wrappers, or the spec to make it from. If its wrappers do not record how they
             were made, nothing is known.
     """
     if isinstance(env, EnvSpec):
-        spec = deepcopy(env)
-        spec.kwargs.pop("render_mode", None)
-        # SB3's monitor does not record how it was made, but leaves the task as it is.
-        spec.additional_wrappers = tuple(
-            wrapper for wrapper in spec.additional_wrappers if wrapper.entry_point != MONITOR
-        )
-        if any(wrapper.kwargs is None for wrapper in spec.additional_wrappers):
+        made = made_from(env)
+        if made is None:
             return None
-        made = gym.make(spec)
         try:
             return find(made)
         finally:
             made.close()
+    changing = []
     while isinstance(env, gym.Wrapper):
         if _may_change_task(env):
-            return None
+            if not only_maps_actions(env):
+                return None
+            changing.append(env)
         env = env.env
     task = _TASKS.get(f"{type(env).__module__}:{type(env).__qualname__}")
-    return None if task is None or not _has_its_own_model(env) else task(env)
+    return None if task is None or not _has_its_own_model(env) else _of_chosen_actions(task(env), changing)
+
+
+def made_from(spec: EnvSpec) -> gym.Env | None:
+    """The environment of a spec with its wrappers, but for SB3's monitor; None if they do not record how to."""
+    spec = deepcopy(spec)
+    spec.kwargs.pop("render_mode", None)
+    # SB3's monitor does not record how it was made, but leaves the task as it is.
+    spec.additional_wrappers = tuple(wrapper for wrapper in spec.additional_wrappers if wrapper.entry_point != MONITOR)
+    if any(wrapper.kwargs is None for wrapper in spec.additional_wrappers):
+        return None
+    return gym.make(spec)
+
+
+def _of_chosen_actions(task: KnownTask, changing: list[gym.Wrapper]) -> KnownTask:
+    try:
+        reward_fn, planned = (
+            None if each is None else of_chosen(each, changing) for each in (task.reward_fn, task.planning_reward_fn)
+        )
+    except ChangingActionsError:
+        reward_fn = planned = None
+    return task._replace(reward_fn=reward_fn, planning_reward_fn=planned)
+
+
+def offered_reward(env: gym.Env, reward_fn: RewardFn) -> RewardFn:
+    """The ``reward_fn`` that a layer of an environment offers, as a function of the actions that its outermost takes.
+
+    Raises:
+        ChangingActionsError: naming a wrapper before that layer which may perform another action than the chosen one,
+            and which is not a function of the chosen one alone.
+    """
+    return of_chosen(reward_fn, [each for each in layers_above(env, "reward_fn") if may_change_actions(each)])
+
+
+def may_change_actions(wrapper: Any) -> bool:
+    """Whether another action may be performed under this wrapper of an environment than the one it is given.
+
+    It may under any wrapper with a `step` of its own. Exceptions: wrappers that keep the whole task (see `find`), that
+    change observations or rewards alone, or that have an attribute ``keeps_actions = True``.
+    """
+    keeps = isinstance(wrapper, ACTION_KEEPERS) or getattr(type(wrapper), "keeps_actions", False)
+    return not keeps and _may_change_task(wrapper)
 
 
 def _may_change_task(wrapper: Any) -> bool:

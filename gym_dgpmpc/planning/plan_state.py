@@ -39,7 +39,7 @@ def unpack(packed: PackedPlans, cold: PlanState, num_envs: int, actions_per_plan
     names = list(_shapes(cold, num_envs))
     if len(packed) != len(names):
         raise ValueError(f"state must be what predict returned: {len(names)} arrays {names}, got {len(packed)}")
-    tensors = {name: torch.as_tensor(array) for name, array in zip(names, packed, strict=True)}
+    tensors = {name: torch.from_numpy(np.array(array)) for name, array in zip(names, packed, strict=True)}
     return plans_from_tensors(tensors, cold, num_envs, actions_per_plan)
 
 

@@ -45,7 +45,8 @@ class FlatDict(VecEnvWrapper):
                 raise ValueError(
                     "every part of a Dict observation space must be a one-dimensional Box of floats, got "
                     f"{part} for {key!r}. Leave the part out with gymnasium.wrappers.FilterObservation, or make nested "
-                    "parts one vector with FlattenObservation; images are not supported"
+                    "parts one vector with FlattenObservation, and floats of whole numbers with DtypeObservation "
+                    "around it; images are not supported"
                 )
         self.dict_space = space
         boxes = [space[key] for key in sorted(space.spaces)]
@@ -144,11 +145,14 @@ class GoalReward:
             needs it.
         achieved: where in the vector the achieved goal is.
         desired: where in the vector the desired goal is.
+        in_rows: whether it is called as Stable-Baselines3's HER calls it, with goals [n, G] and a list of n infos;
+            else with goals [*b, G] and one. Infos are empty dicts: nobody knows what a predicted step would tell.
     """
 
-    compute_reward: Callable[[np.ndarray, np.ndarray, dict[str, Any]], Any]
+    compute_reward: Callable[[np.ndarray, np.ndarray, Any], Any]
     achieved: slice
     desired: slice
+    in_rows: bool = False
 
     @classmethod
     def of(cls, env: VecEnv | None) -> "GoalReward | None":
@@ -157,7 +161,7 @@ class GoalReward:
         if env is None or not {ACHIEVED, DESIRED} <= set(parts) or not env.has_attr("compute_reward"):
             return None
 
-        def compute_reward(achieved: np.ndarray, desired: np.ndarray, info: dict[str, Any]) -> Any:
+        def compute_reward(achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
             # Called by its name, because the environment may be in another process.
             return env.env_method("compute_reward", achieved, desired, info, indices=[0])[0]
 
@@ -171,9 +175,16 @@ class GoalReward:
     ) -> Float[Tensor, "*b"]:
         """The rewards of the steps; they do not depend on ``observation`` and ``action``."""
         achieved, desired = (
-            next_observation[..., part].double().cpu().numpy() for part in (self.achieved, self.desired)
+            np.array(next_observation[..., part].double().cpu().numpy()) for part in (self.achieved, self.desired)
         )
-        reward = np.asarray(self.compute_reward(achieved, desired, {}))
+        batch = achieved.shape[:-1]
+        if self.in_rows:
+            achieved, desired = (goals.reshape(-1, goals.shape[-1]) for goals in (achieved, desired))
+            count = len(achieved)
+            reward = np.array(self.compute_reward(achieved, desired, [{} for _ in range(count)]))
+            reward = reward.reshape(batch) if reward.shape == (count,) else reward
+        else:
+            reward = np.array(self.compute_reward(achieved, desired, {}))
         return torch.as_tensor(reward, dtype=next_observation.dtype, device=next_observation.device)
 
 

@@ -10,10 +10,14 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
+from gym_dgpmpc.tasks.borders import guard
 from gym_dgpmpc.tasks.dict_observations import flattened, layout
 from gym_dgpmpc.tasks.replay import options_to_reset, remember_starts
+
+MOVING = (gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward)
+"""Wrappers whose statistics follow what they see, unless they are frozen."""
 
 
 def wrapped_env(env: GymEnv | str) -> VecEnv:
@@ -28,6 +32,7 @@ def wrapped_env(env: GymEnv | str) -> VecEnv:
     _refuse_no_environment(env)
     vec_env = flattened(BaseAlgorithm._wrap_env(maybe_make_env(env, 0)))
     check_env(vec_env)
+    guard(vec_env)
     remember_starts(vec_env)
     return vec_env
 
@@ -48,15 +53,15 @@ def check_env(env: VecEnv) -> None:
 
     Raises:
         ValueError: an observation that is not a vector of real numbers, an action that is unbounded or not of real
-            numbers, or normalised observations.
+            numbers, or observations or rewards that are normalised by moving statistics.
         AssertionError: an action space that is not a Box, as from every SB3 algorithm.
     """
     observation, action = env.observation_space, env.action_space
     if not isinstance(observation, spaces.Box) or len(observation.shape) != 1 or observation.dtype.kind != "f":
         raise ValueError(
             "the dynamics model learns vectors of real numbers: the observation space must be a one-dimensional Box of "
-            f"floats, or a Dict of such, got {observation}. gymnasium.wrappers.FlattenObservation makes one of nested "
-            "vectors; images are not supported"
+            f"floats, or a Dict of such, got {observation}. {_how_to_make_floats(observation)}; images are not "
+            "supported"
         )
     assert isinstance(action, spaces.Box), (
         f"The algorithm only supports {spaces.Box} as action spaces but {action} was provided: "
@@ -80,6 +85,38 @@ def check_env(env: VecEnv) -> None:
             "got VecNormalize(norm_obs=True): its moving statistics would change the meaning of the transitions "
             "already stored and of the reward function. Use norm_obs=False; the dynamics model standardises for itself"
         )
+    normalizing = _moving_normalizer(env)
+    if normalizing is not None:
+        raise ValueError(
+            f"got {normalizing}: its moving statistics would change the meaning of the transitions already stored and "
+            "of the reward function. Leave it out, for the dynamics model standardises for itself, or freeze it with "
+            "update_running_mean = False"
+        )
+
+
+def _how_to_make_floats(space: spaces.Space) -> str:
+    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+        return "gymnasium.wrappers.DtypeObservation(env, numpy.float32) makes floats of whole numbers"
+    return (
+        "gymnasium.wrappers.FlattenObservation makes one vector of nested ones or of a matrix, and "
+        "DtypeObservation(env, numpy.float32) floats of whole numbers"
+    )
+
+
+def _moving_normalizer(env: VecEnv) -> str | None:
+    """The name of a wrapper of Gymnasium's whose statistics of observations or rewards are still moving."""
+    inner = env.unwrapped
+    if not isinstance(inner, DummyVecEnv):
+        # In another process the outermost one is seen.
+        names = {"obs_rms": "NormalizeObservation", "return_rms": "NormalizeReward"}
+        is_moving = offered_by(inner, "update_running_mean") is True
+        return next((named for name, named in names.items() if is_moving and inner.has_attr(name)), None)
+    for layer in inner.envs:
+        while isinstance(layer, gym.Wrapper):
+            if isinstance(layer, MOVING) and layer.update_running_mean:
+                return type(layer).__name__
+            layer = layer.env
+    return None
 
 
 def offered_by(env: VecEnv | None, name: str) -> Any:

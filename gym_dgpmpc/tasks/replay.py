@@ -95,7 +95,7 @@ def can_replay(start: EpisodeStart) -> bool:
     this package.
     """
     if start.has_wrapper_attr("can_replay"):
-        return bool(start.get_wrapper_attr("can_replay"))
+        return start.get_wrapper_attr("can_replay") is True  # another package's method of that name says nothing
     classes = type(start.unwrapped).__mro__
     return type(start.unwrapped).__module__.startswith(SIMULATORS) or any(
         each.__module__ == "gymnasium.envs.mujoco.mujoco_env" for each in classes
@@ -192,7 +192,7 @@ def replay(
     observation: Any = None
     shape = vec_env.action_space.shape or ()
     for step, action in enumerate(actions):
-        observation, reward, dones, _ = vec_env.step(action.reshape(1, *shape))
+        observation, reward, dones, _ = vec_env.step(action.reshape(1, *shape).copy())
         if dones[0]:
             return f"the episode ended at its step {step}"
         if not np.array_equal(np.asarray(observation[0], dtype=np.float32), next_observations[step]):

@@ -17,7 +17,8 @@ def disagreements(functions: TaskFunctions, store: TransitionStore, device: torc
 
     A reward function that is meant to differ from what `step` returns is not compared.
     """
-    observation, action, after = (tensor.to(device) for tensor in store.transitions())
+    # Copies: a function may write into what it is given.
+    observation, action, after = (tensor.clone().to(device) for tensor in store.transitions())
     found = []
     if functions.reward_fn is not None and functions.is_reported:
         planned, returned = functions.reward_fn(observation, action, after).cpu(), store.rewards

@@ -19,7 +19,7 @@ from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import UnknownRewardError
 from gym_dgpmpc.tasks.environment import about_environment, describe, flat_size
 from gym_dgpmpc.tasks.first_batch import REWARD_SIGNATURE
-from gym_dgpmpc.tasks.functions import LEARNED, Learned, TaskFunctions, find_functions, find_observation_spec
+from gym_dgpmpc.tasks.functions import LEARNED, Learned, Never, TaskFunctions, find_functions, find_observation_spec
 from gym_dgpmpc.tasks.modelled import ModelledVector
 from gym_dgpmpc.types import ObservationSpec, RewardFn, StateDict, TerminatedFn, Transitions
 
@@ -33,7 +33,7 @@ class TaskArguments(NamedTuple):
     """What the user gave of a task: each a function or a spec, or None to look for one on the environment."""
 
     reward_fn: RewardFn | Learned | None
-    terminated_fn: TerminatedFn | Learned | None
+    terminated_fn: TerminatedFn | Learned | Never | None
     observation_spec: ObservationSpec | None
 
 

@@ -71,7 +71,8 @@ class RiskSensitiveReward(gym.Wrapper, RecordConstructorArgs):
         penalise_step: return the penalised reward from `step` too.
 
     Raises:
-        ValueError: the environment's reward is not known as a function, or an argument is out of its range.
+        ValueError: the environment's reward is not known as a function of the actions that it is given, or an argument
+            is out of its range.
     """
 
     keeps_observations = True  # for `known.may_change_observations`
@@ -112,7 +113,7 @@ class RiskSensitiveReward(gym.Wrapper, RecordConstructorArgs):
 def _reward_of(env: gym.Env) -> RewardFn:
     """What the environment offers, else what is known of it."""
     if env.has_wrapper_attr("reward_fn"):
-        return env.get_wrapper_attr("reward_fn")
+        return known.offered_reward(env, env.get_wrapper_attr("reward_fn"))
     task = known.find(env)
     if task is None or task.reward_fn is None:
         raise ValueError(

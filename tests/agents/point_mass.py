@@ -119,7 +119,8 @@ def planner(**arguments):
 def agent(env=None, **arguments):
     """An `MPCAgent` on the point mass, quick and seeded."""
     env = KnownPointMass() if env is None else env
-    return MPCAgent(env, arguments.pop("dynamics", None) or LinearModel(), planner(), **{"seed": 0, **arguments})
+    made_of = [arguments.pop("dynamics", None) or LinearModel(), arguments.pop("planner", None) or planner()]
+    return MPCAgent(env, *made_of, **{"seed": 0, **arguments})
 
 
 def actions_of(env):

@@ -290,7 +290,6 @@ def test_wrappers_that_leave_the_task_alone():
     "wrap",
     [
         Shaped,
-        lambda env: wrappers.RescaleAction(env, np.float32(-1), np.float32(1)),
         wrappers.NormalizeObservation,
         wrappers.NormalizeReward,
         lambda env: wrappers.TransformReward(env, lambda reward: -reward),
