@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 from jaxtyping import Bool, Float
 from numpy import ndarray
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
@@ -18,6 +19,7 @@ from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.plan_state import PlanState, plans_from_tensors, plans_to_tensors
+from gym_dgpmpc.tasks.actions import performed
 from gym_dgpmpc.tasks.dict_observations import flatten
 from gym_dgpmpc.tasks.logged import LoggedRows
 from gym_dgpmpc.tasks.replay import episode_start
@@ -133,11 +135,14 @@ class Collector:
             EnvironmentFailedError: an environment raised an exception, which is the cause.
             EnvironmentDataError: it returned something that is not finite; nothing is stored.
         """
+        assert isinstance(env.action_space, spaces.Box)
+        given = performed(actions, env.action_space)
+        actions = given.reshape(actions.shape).astype(np.float32)
         start = episode_start(env)
         if start is not None:
             start.last_step = None
         try:
-            new_obs, rewards, dones, infos = env.step(actions.reshape(-1, *(env.action_space.shape or ())))
+            new_obs, rewards, dones, infos = env.step(given)
         except Exception as error:
             self._keep_last_step(env, observations, actions)
             has_name = isinstance(error, EnvironmentFailedError)

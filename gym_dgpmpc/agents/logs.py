@@ -128,7 +128,9 @@ class Logs:
 
 
 def _column(values: Iterable[Any]) -> Tensor:
-    return torch.tensor([float(value) if _is_number(value) else math.nan for value in values], dtype=torch.float64)
+    return torch.tensor(
+        [float(value) if _is_number(value) else math.nan for value in values], dtype=torch.float64, device="cpu"
+    )
 
 
 def _is_number(value: Any) -> bool:

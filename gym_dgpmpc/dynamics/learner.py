@@ -1,6 +1,6 @@
 """The base of models that are fitted to encoded transitions: the encoding, and whether there was a fit yet."""
 
-from typing import Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -17,6 +17,8 @@ Fitted = TypeVar("Fitted")
 class Learner(Generic[Fitted]):
     """Base of a `DynamicsModel` that keeps what a fit left in ``_fitted``.
 
+    Transitions and states of rollouts may be float64: see `takes_float64`.
+
     Args:
         observation_size: S.
         action_size: A.
@@ -24,6 +26,9 @@ class Learner(Generic[Fitted]):
         dtype: precision of rollouts.
         device: where tensors live.
     """
+
+    takes_float64: ClassVar[bool] = True
+    """Whether observations may come as float64, where float32 would hide their changes; states then are float64."""
 
     def __init__(
         self,
@@ -56,7 +61,9 @@ class Learner(Generic[Fitted]):
         """
         x, y = self._encode(data)
         magnitudes = self.encoder.target_magnitudes(data.observation, data.next_observation)
-        inputs, targets = Normaliser.fit(x), Normaliser.fit(y, magnitudes.to(y))
+        precision = data.observation.dtype
+        inputs = Normaliser.fit(x, precision=precision)
+        targets = Normaliser.fit(y, magnitudes.to(y), precision)
         return (inputs, targets), Data(inputs(x), targets(y))
 
     def _require_fit(self, verb: str) -> Fitted:

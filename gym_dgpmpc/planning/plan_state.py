@@ -39,7 +39,7 @@ def unpack(packed: PackedPlans, cold: PlanState, num_envs: int, actions_per_plan
     names = list(_shapes(cold, num_envs))
     if len(packed) != len(names):
         raise ValueError(f"state must be what predict returned: {len(names)} arrays {names}, got {len(packed)}")
-    tensors = {name: torch.as_tensor(array) for name, array in zip(names, packed, strict=True)}
+    tensors = {name: torch.from_numpy(np.asarray(array)) for name, array in zip(names, packed, strict=True)}
     return plans_from_tensors(tensors, cold, num_envs, actions_per_plan)
 
 
@@ -47,7 +47,7 @@ def plans_to_tensors(states: Sequence[PlanState]) -> dict[str, Tensor]:
     """The plans of n environments, on the CPU: each field as "plan.<field>" [n, ...], and "plan.age" [n]."""
     plans = [state.plan._asdict() for state in states]
     fields = {f"plan.{name}": torch.stack([plan[name] for plan in plans]).cpu() for name in plans[0]}
-    return fields | {AGE: torch.tensor([state.age for state in states], dtype=torch.int64)}
+    return fields | {AGE: torch.tensor([state.age for state in states], dtype=torch.int64, device="cpu")}
 
 
 def plans_from_tensors(
