@@ -94,8 +94,8 @@ TENSOR_FACTORIES = {
     f"torch.{name}"
     for name in (
         "arange", "as_tensor", "asarray", "empty", "eye", "frombuffer", "full", "linspace", "logspace", "normal",
-        "ones", "rand", "randint", "randn", "randperm", "range", "scalar_tensor", "tensor", "tril_indices", "triu_indices",
-        "zeros",
+        "ones", "rand", "randint", "randn", "randperm", "range", "scalar_tensor", "tensor", "tril_indices",
+        "triu_indices", "zeros",
     )
 }  # fmt: skip
 """What takes dtype or device of the process's defaults where it is not told; `from_numpy`, *_like and new_* do not."""

@@ -147,16 +147,15 @@ for name, (agent_class, settings) in AGENTS.items():
 """
 
 
-@pytest.mark.parametrize("defaults", [("float64", "cpu"), ("float32", "meta")])
-def test_the_defaults_of_the_process_change_nothing(defaults):
+def test_the_defaults_of_the_process_change_nothing():
     """On the device "meta" there are no numbers, so a tensor that is made there by mistake is an error."""
     printed = []
-    for arguments in (("float32", "cpu"), defaults):
-        command = [sys.executable, "-c", DEFAULTS, *arguments]
+    for defaults in (("float32", "cpu"), ("float64", "cpu"), ("float32", "meta")):
+        command = [sys.executable, "-c", DEFAULTS, *defaults]
         run = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
         assert run.returncode == 0, run.stderr
         printed.append(run.stdout)
-    assert printed[0] == printed[1] and len(printed[0].splitlines()) == len(AGENTS)
+    assert printed[0] == printed[1] == printed[2] and len(printed[0].splitlines()) == len(AGENTS)
 
 
 @pytest.mark.parametrize("name", ["compiled", "pathwise", "PETS", "GP"])
