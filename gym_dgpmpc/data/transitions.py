@@ -169,6 +169,11 @@ class TransitionStore:
             loaded._add(*fields)
         except EnvironmentDataError as error:
             raise CheckpointError(f"the stored transitions do not fit this store: {error}") from error
+        for name in EXACT:
+            if not isinstance(state[name], Tensor) or not torch.equal(state[name].cpu(), loaded._view(name)):
+                raise CheckpointError(
+                    f"stored {name} must be finite, and the float32 of {names[name]} where that is held"
+                )
         self._buffers, self._length = loaded._buffers, loaded._length
 
     def _view(self, name: str) -> Tensor:
