@@ -90,6 +90,17 @@ TENSOR_RANDOM = {
     "bernoulli_", "cauchy_", "exponential_", "geometric_", "log_normal_", "normal_", "random_", "uniform_",
 }  # fmt: skip
 
+TENSOR_FACTORIES = {
+    f"torch.{name}"
+    for name in (
+        "arange", "as_tensor", "asarray", "empty", "eye", "frombuffer", "full", "linspace", "logspace", "normal",
+        "ones", "rand", "randint", "randn", "randperm", "range", "scalar_tensor", "tensor", "tril_indices",
+        "triu_indices", "zeros",
+    )
+}  # fmt: skip
+"""What takes dtype or device of the process's defaults where it is not told; `from_numpy`, *_like and new_* do not."""
+ALWAYS_INTEGERS = {"torch.randint", "torch.randperm"}
+
 
 NOTATION = PACKAGE.parent / "docs" / "notation.md"
 
@@ -148,6 +159,19 @@ def unseeded_calls(tree: ast.AST) -> list[str]:
         legacy_numpy = legacy_numpy and not name.endswith("default_rng")
         if legacy_numpy or ((name in TORCH_RANDOM or method in TENSOR_RANDOM) and not has_generator):
             found.append(f"line {node.lineno}: {name or method}")
+    return found
+
+
+def by_default(tree: ast.AST) -> list[str]:
+    """Calls that make tensors without naming dtype and device, so that the process's defaults decide."""
+    found = []
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call) or dotted(node.func) not in TENSOR_FACTORIES:
+            continue
+        name, named = dotted(node.func), {keyword.arg for keyword in node.keywords}
+        needed = {"device"} if name in ALWAYS_INTEGERS else {"dtype", "device"}
+        if not needed <= named:
+            found.append(f"line {node.lineno}: {name} without {', '.join(sorted(needed - named))}")
     return found
 
 
@@ -233,6 +257,11 @@ def test_randomness_is_an_argument(tree):
     assert forbidden(tree, GLOBAL_RANDOMNESS) == []
 
 
+def test_no_tensor_is_made_by_the_processs_defaults(module, tree):
+    if module.startswith("gym_dgpmpc."):  # the benchmarks are programs, and set the defaults of their own process
+        assert by_default(tree) == []
+
+
 def test_needs_no_newer_python(tree):
     assert too_new(tree) == []
 
@@ -278,6 +307,22 @@ def test_upward_imports_are_found(module_name, line, found):
 )
 def test_unseeded_calls_are_found(line, count):
     assert len(unseeded_calls(ast.parse(line))) == count
+
+
+@pytest.mark.parametrize(
+    ("line", "count"),
+    [
+        ("torch.zeros(3, dtype=x.dtype, device=x.device)", 0),
+        ("torch.randperm(3, generator=g, device='cpu')", 0),
+        ("x.new_zeros(3), torch.zeros_like(x), torch.from_numpy(y)", 0),
+        ("torch.zeros(3)", 1),
+        ("torch.eye(3, dtype=torch.float32).to(x)", 1),
+        ("torch.randperm(3, generator=g)", 1),
+        ("torch.tensor([1.0], device='cpu')", 1),
+    ],
+)
+def test_tensors_made_by_default_are_found(line, count):
+    assert len(by_default(ast.parse(line))) == count
 
 
 @pytest.mark.parametrize("line", ["import pickle", "from torch import load", "torch.load(f)", "import joblib.memory"])

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 from jaxtyping import Bool, Float
 from numpy import ndarray
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
@@ -20,6 +21,7 @@ from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.plan_state import AGE, PlanState, plans_from_tensors, plans_to_tensors
+from gym_dgpmpc.tasks.actions import performed
 from gym_dgpmpc.tasks.borders import received_batch, terminal_observation, warn_of_shared_memory
 from gym_dgpmpc.tasks.dict_observations import flatten
 from gym_dgpmpc.tasks.logged import LoggedRows
@@ -142,12 +144,14 @@ class Collector:
             EnvironmentDataError: it returned something that is not finite or has another shape; the step is not
                 stored, unless it ended an episode and it is the reset after it that did so.
         """
+        assert isinstance(env.action_space, spaces.Box)
+        given = performed(actions, env.action_space)
+        actions = given.reshape(actions.shape).astype(np.float32)
         start = episode_start(env)
         if start is not None:
             start.last_step = None
         try:
-            # The environments may write into what they are given.
-            new_obs, rewards, dones, infos = env.step(actions.reshape(-1, *(env.action_space.shape or ())).copy())
+            new_obs, rewards, dones, infos = env.step(given)
         except EnvironmentDataError as error:
             self._keep_last_step(env, observations, actions)
             raise EnvironmentDataError(f"step {number}: {error}") from error

@@ -1,6 +1,7 @@
 """What happened in one episode: rewards, plans and their cost, as numbers to log and as one readable line."""
 
 import time
+from typing import Any
 
 import numpy as np
 import torch
@@ -120,26 +121,21 @@ class EpisodeRecord:
     def state_dict(self) -> dict[str, Tensor]:
         """Everything but the number, which is counted elsewhere."""
         return {
-            "rewards": torch.tensor(self.rewards, dtype=torch.float64),
-            "expected_return": torch.tensor([info.expected_return for info in self.plans], dtype=torch.float64),
-            "num_nonfinite": torch.tensor([info.num_nonfinite for info in self.plans], dtype=torch.int64),
+            "rewards": _column(self.rewards),
+            "expected_return": _column([info.expected_return for info in self.plans]),
+            "num_nonfinite": _column([info.num_nonfinite for info in self.plans], torch.int64),
             **self._metric_columns(),
-            "plan_steps": torch.tensor(self.plan_steps, dtype=torch.int64),
-            "plan_seconds": torch.tensor(self.plan_seconds, dtype=torch.float64),
-            "num_late": torch.tensor(self.num_late),
-            "has_terminated": torch.tensor(self.has_terminated),
-            "seconds": torch.tensor(self.seconds, dtype=torch.float64),
+            "plan_steps": _column(self.plan_steps, torch.int64),
+            "plan_seconds": _column(self.plan_seconds),
+            "num_late": _column(self.num_late, torch.int64),
+            "has_terminated": _column(self.has_terminated, torch.bool),
+            "seconds": _column(self.seconds),
         }
 
     def _metric_columns(self) -> dict[str, Tensor]:
         """Each metric of the planner, one number per plan; NaN where a plan lacks it."""
         names = sorted({name for info in self.plans for name in info.metrics})
-        return {
-            METRIC + name: torch.tensor(
-                [info.metrics.get(name, float("nan")) for info in self.plans], dtype=torch.float64
-            )
-            for name in names
-        }
+        return {METRIC + name: _column([info.metrics.get(name, float("nan")) for info in self.plans]) for name in names}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Go on from `state_dict`.
@@ -166,6 +162,10 @@ class EpisodeRecord:
         self.num_late = int(state["num_late"])
         self.has_terminated = bool(state.get("has_terminated", False))  # older files do not say
         self._started = time.perf_counter() - float(state["seconds"])
+
+
+def _column(values: Any, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.tensor(values, dtype=dtype, device="cpu")
 
 
 def _plan_columns(state: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -138,7 +138,9 @@ def _waiting(name: str, value: float, weight: int, left_out_of: list[str] | None
 
 
 def _column(values: Iterable[Any]) -> Tensor:
-    return torch.tensor([float(value) if _is_number(value) else math.nan for value in values], dtype=torch.float64)
+    return torch.tensor(
+        [float(value) if _is_number(value) else math.nan for value in values], dtype=torch.float64, device="cpu"
+    )
 
 
 def _is_number(value: Any) -> bool:

@@ -213,7 +213,8 @@ class MPCAgent(BaseAlgorithm):
         if _init_setup_model:
             if self.seeds_environment:
                 super().set_random_seed(self.seed)
-            self._setup_model()
+            with torch.inference_mode(False):  # of what is made in it, nothing could be trained later
+                self._setup_model()
 
     # ------------------------------------------------------------------------------------------ what it is made of
 
@@ -245,7 +246,11 @@ class MPCAgent(BaseAlgorithm):
 
     def _setup_model(self) -> None:
         """Create what an untrained agent has, once the spaces are known."""
-        self.store = TransitionStore(flat_size(self.observation_space), flat_size(self.action_space))
+        self.store = TransitionStore(
+            flat_size(self.observation_space),
+            flat_size(self.action_space),
+            observation_dtype=torch.float64 if self.observation_space.dtype == np.float64 else torch.float32,
+        )
         self.generators: Generators = split_seed(self.seed, self.device)
         self.task = Task(self.env, self.observation_space, self.action_space, self._task_given, self.device)
         planner = self.composition.make_planner(self.action_space, self.device)
@@ -405,7 +410,8 @@ class MPCAgent(BaseAlgorithm):
         if found.reward_fn is None and not self.task.modelled.reward:
             if self.is_fitted or not self.task.can_model_more:
                 raise self.task.unknown_reward(env)
-            self._model_anew(reward=True, terminated=self.task.modelled.terminated)
+            with torch.inference_mode(False):
+                self._model_anew(reward=True, terminated=self.task.modelled.terminated)
         self.n_envs = env.num_envs  # which may be another number than before
         super().set_env(env, force_reset)
         self.task.move(env, found)
@@ -546,6 +552,8 @@ class MPCAgent(BaseAlgorithm):
         if self.env is None:
             raise ValueError("the agent has no environment to learn in: pass env=... to load, or call set_env(env)")
         with (
+            torch.inference_mode(False),
+            torch.enable_grad(),
             safeguard(self, run_folder, resume=resume, checkpoint_every=checkpoint_every) as guard,
             Bars(progress_bar) as self._bars,
         ):
@@ -706,8 +714,9 @@ class MPCAgent(BaseAlgorithm):
         if not self.is_training_due:
             return
         task = self.task
+        task.look_at_precision(self.store, takes_float64=getattr(self.dynamics, "takes_float64", False))
         if not self.is_fitted:
-            for disagreement in disagreements(task.functions, self.store, self.device):
+            for disagreement in disagreements(task.functions_of_data, self.store, self.device, exact=task.is_exact):
                 self._warn_once(disagreement)
         if task.learns_termination and not task.modelled.terminated and self.store.terminated.any():
             self._model_anew(reward=task.modelled.reward, terminated=True)
@@ -857,7 +866,8 @@ class MPCAgent(BaseAlgorithm):
         """
         if print_system_info:
             get_system_info()
-        return load_agent(cls, path, env, device, force_reset, kwargs)
+        with torch.inference_mode(False):
+            return load_agent(cls, path, env, device, force_reset, kwargs)
 
     def get_parameters(self) -> dict[str, dict]:
         """The learned state of the dynamics model, by SB3's name for such things."""

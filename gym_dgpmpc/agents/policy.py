@@ -14,6 +14,7 @@ from gym_dgpmpc.errors import EnvironmentDataError
 from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.plan_state import PackedPlans, PlanState, pack, unpack
 from gym_dgpmpc.randomness import Generators, observation_generator
+from gym_dgpmpc.tasks.actions import performed
 from gym_dgpmpc.tasks.dict_observations import check_parts, flatten, layout
 from gym_dgpmpc.tasks.environment import flat_size
 from gym_dgpmpc.tasks.task import Task
@@ -70,14 +71,14 @@ class MPCPolicy(BasePolicy):
         actions = []
         for i, row in enumerate(observations):
             action, carried[i] = self._act(row, cold if starts[i] else carried[i], deterministic)
-            actions.append(action.reshape(self.action_space.shape).astype(self.action_space.dtype))
+            actions.append(performed(action[None], self.action_space)[0])
         return np.stack(actions) if is_batch else actions[0], pack(carried)
 
     def _act(self, observation: ndarray, carried: PlanState, deterministic: bool) -> tuple[ndarray, PlanState]:
         agent = self._agent
         controller, generator = agent.controller, agent.generators.prediction
         if deterministic:
-            generator = observation_generator(agent.seed, observation, controller.device)
+            generator = observation_generator(agent.seed, observation.astype(np.float32), controller.device)
         if not agent.is_fitted:
             self._warn_once("predict was called before the agent has learned: there is no model to plan with")
             return controller.midpoint() if deterministic else controller.uniform(generator), controller.cold
@@ -95,21 +96,24 @@ class MPCPolicy(BasePolicy):
             else (observation.cpu().numpy())
         )
         actions, _ = self.predict(rows, deterministic=deterministic)
-        return torch.as_tensor(actions, device=self._agent.controller.device)
+        return torch.from_numpy(actions).to(self._agent.controller.device)
 
     def _checked(self, observation: Any) -> tuple[ndarray, bool]:
-        """Observations as float32 [n, S], and whether they came with that first dimension."""
+        """Observations [n, S], float32 unless their space is float64, and whether they came with that dimension."""
         if isinstance(observation, tuple):
             raise ValueError(
                 f"predict takes an observation, got a tuple of {len(observation)}: Gymnasium's reset returns "
                 "(observation, info), of which the first is meant"
             )
         check_parts(observation, layout(self._agent.env))
-        array = np.array(flatten(observation), dtype=np.float32)
+        dtype = np.float64 if self.observation_space.dtype == np.float64 else np.float32
+        array = np.array(flatten(observation), dtype=dtype)
         size = flat_size(self.observation_space)
         if array.ndim not in (1, 2) or array.shape[-1] != size:
             raise ValueError(f"expected an observation of shape ({size},) or (n, {size}), got {array.shape}")
-        if not np.all(np.isfinite(array)):
+        with np.errstate(over="ignore"):
+            is_finite = np.isfinite(array.astype(np.float32))
+        if not np.all(is_finite):
             raise EnvironmentDataError(f"cannot plan from an observation that is not finite: {observation}")
         return array.reshape(-1, size), array.ndim == 2
 

@@ -3,6 +3,7 @@
 import warnings
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from gym_dgpmpc.checks import saved_count
@@ -26,8 +27,8 @@ class Progress:
         state: StateDict = {"num_timesteps": agent.num_timesteps, "num_fitted": agent.num_fitted}
         state["num_episodes"] = agent._episode_num
         if agent._last_obs is not None:
-            state["last_observation"] = torch.tensor(agent._last_obs)
-            state["last_episode_starts"] = torch.tensor(agent._last_episode_starts)
+            state["last_observation"] = torch.from_numpy(agent._last_obs.copy())
+            state["last_episode_starts"] = torch.from_numpy(np.array(agent._last_episode_starts))
         return state
 
     def load_state_dict(self, state: StateDict) -> None:

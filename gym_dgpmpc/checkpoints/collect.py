@@ -65,9 +65,8 @@ def _space(agent: Checkpointed, name: str) -> spaces.Box:
 
 def _bounds(agent: Checkpointed) -> dict[str, Tensor]:
     """The bounds of observations and actions."""
-    return {
-        f"{name}.{side}": torch.tensor(getattr(_space(agent, name), side)) for name in SPACES for side in BOUNDS
-    }  # fmt: skip
+    sides = ((name, side) for name in SPACES for side in BOUNDS)
+    return {f"{name}.{side}": torch.from_numpy(getattr(_space(agent, name), side).copy()) for name, side in sides}
 
 
 def _version(package: str) -> str:

@@ -105,4 +105,4 @@ def _logs(config: Config, own: dict[str, Tensor], schema: int) -> tuple[dict[str
         raise ValueError(f"{len(infos)} summaries of episodes have {len(names)} names between them")
     columns = {f"ep_info.{name}": [float(info.get(name, "nan")) for info in infos] for name in names}
     columns["ep_successes"] = [float(success) for success in config["episode_successes"]]
-    return {name: torch.tensor(column, dtype=torch.float64) for name, column in columns.items()}, values
+    return {name: torch.tensor(column, dtype=torch.float64, device="cpu") for name, column in columns.items()}, values

@@ -86,10 +86,14 @@ class Encoder:
         if not self.input_size:
             raise ValueError(f"nothing is left to feed: there is no action, and not_inputs is everything, got {spec}")
         self.carried = torch.tensor(
-            [float(i in spec.constant or i not in spec.absolute) for i in range(observation_size)]
+            [float(i in spec.constant or i not in spec.absolute) for i in range(observation_size)],
+            dtype=torch.float32,
+            device="cpu",
         )
-        self._is_change = torch.tensor([i not in spec.absolute for i in self.predicted])
-        self._wraps = torch.tensor([i in spec.angles and i not in spec.absolute for i in self.predicted])
+        is_change = [i not in spec.absolute for i in self.predicted]
+        self._is_change = torch.tensor(is_change, dtype=torch.bool, device="cpu")
+        wraps = [i in spec.angles and i not in spec.absolute for i in self.predicted]
+        self._wraps = torch.tensor(wraps, dtype=torch.bool, device="cpu")
         self.vectors = VectorColumns.of(spec.body_frame)
         place = {index: column for column, index in enumerate(self.predicted)}
         moving = [(heading, place[x], place[y]) for heading, x, y in spec.body_frame if x in place]

@@ -40,5 +40,9 @@ def minibatch(data: DataSource, size: int, generator: torch.Generator) -> Data:
     """``size`` rows drawn uniformly with replacement; everything if there are no more than that."""
     num_rows = data.num_rows
     if num_rows <= size:
-        return data if isinstance(data, Data) else data.rows(torch.arange(num_rows, device=generator.device))
+        return (
+            data
+            if isinstance(data, Data)
+            else data.rows(torch.arange(num_rows, dtype=torch.int64, device=generator.device))
+        )
     return data.rows(torch.randint(num_rows, (size,), generator=generator, device=generator.device))

@@ -19,17 +19,20 @@ class Coordinates:
         encoder: what is fed and predicted.
         inputs: standardisation of the encoded inputs, size D.
         targets: standardisation of the targets, size T.
-        dtype: precision of the rollout; states come in and go out in any other.
+        dtype: precision of the rollout; states come in and go out in any other. Float64 states keep their precision:
+            what is added to them, and what they are standardised by, is then not rounded to that of the rollout.
 
     Attributes:
         input_mean, input_scale: of the encoded inputs, [D].
+        inputs: the standardisation of the inputs, float64.
+        exact_shift: ``shift`` in float64.
         carried, shift: the next state is carried * state + shift + what the targets add to it, [S] each. The latter two
             are along the body's axes for a vector in ``body_frame``.
         spread: what one unit of each standardised target adds to its dimension of the state, [T].
     """
 
     def __init__(self, encoder: Encoder, inputs: Normaliser, targets: Normaliser, dtype: torch.dtype):
-        self.encoder, self.dtype = encoder, dtype
+        self.encoder, self.dtype, self.inputs = encoder, dtype, inputs
         self.input_mean, self.input_scale = inputs.mean.to(dtype), (1.0 / inputs.std).to(dtype)
         size = encoder.observation_size
         self.carried = encoder.carried.to(self.input_mean)
@@ -40,16 +43,28 @@ class Coordinates:
         self._spread[range(encoder.target_size), encoder.predicted] = self.spread
         self.shift = torch.zeros(size, dtype=dtype, device=self.input_mean.device)
         self.shift[encoder.predicted] = targets.mean.to(dtype)
+        self.exact_shift = torch.zeros(size, dtype=torch.float64, device=self.input_mean.device)
+        self.exact_shift[encoder.predicted] = targets.mean.double()
 
     def encode(self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"]) -> Float[Tensor, "P K D"]:
         """Standardised model inputs."""
+        if self._is_finer(observation):
+            raw = self.encoder.inputs(observation, action.to(observation).expand(observation.shape[0], -1, -1))
+            return self.inputs(raw).to(self.dtype)
         observation, action = observation.to(self.dtype), action.to(self.dtype)
         raw = self.encoder.inputs(observation, action.expand(observation.shape[0], -1, -1))
         return raw.sub_(self.input_mean).mul_(self.input_scale)
 
     def decode(self, observation: Float[Tensor, "*b S"], target: Float[Tensor, "*b T"]) -> Float[Tensor, "*b S"]:
         """The next observation from a standardised target, in the precision of ``observation``."""
+        if self._is_finer(observation):
+            finely = (target.to(self.dtype) @ self._spread).to(observation) + self.exact_shift
+            return self.encoder.vectors.turned(finely, observation, 1.0) + observation * self.carried
         before = observation.to(self.dtype)
         kept = before if self._all_carried else before * self.carried
         added = (target.to(self.dtype) @ self._spread).add_(self.shift)
         return self.encoder.vectors.turned(added, before, 1.0).add_(kept).to(observation.dtype)
+
+    def _is_finer(self, observation: Tensor) -> bool:
+        """Whether states have a precision that the rollout's own would lose."""
+        return observation.dtype == torch.float64 != self.dtype

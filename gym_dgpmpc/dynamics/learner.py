@@ -1,6 +1,6 @@
 """The base of models that are fitted to encoded transitions: the encoding, and whether there was a fit yet."""
 
-from typing import Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -18,6 +18,8 @@ Fitted = TypeVar("Fitted")
 class Learner(Generic[Fitted]):
     """Base of a `DynamicsModel` that keeps what a fit left in ``_fitted``.
 
+    Transitions and states of rollouts may be float64: see `takes_float64`.
+
     Args:
         observation_size: S.
         action_size: A.
@@ -28,6 +30,9 @@ class Learner(Generic[Fitted]):
     Attributes:
         on_progress: see `ReportsProgress`.
     """
+
+    takes_float64: ClassVar[bool] = True
+    """Whether observations may come as float64, where float32 would hide their changes; states then are float64."""
 
     def __init__(
         self,
@@ -62,7 +67,9 @@ class Learner(Generic[Fitted]):
         """
         x, y = self._encode(data)
         magnitudes = self.encoder.target_magnitudes(data.observation, data.next_observation)
-        inputs, targets = Normaliser.fit(x), Normaliser.fit(y, magnitudes.to(y))
+        precision = data.observation.dtype
+        inputs = Normaliser.fit(x, precision=precision)
+        targets = Normaliser.fit(y, magnitudes.to(y), precision)
         return (inputs, targets), Data(inputs(x), targets(y))
 
     def _require_fit(self, verb: str) -> Fitted:

@@ -29,6 +29,8 @@ class TrueDynamics:
         ValueError: its simulator cannot be used; see `Simulator`.
     """
 
+    takes_float64 = True  # as a simulator's own state is
+
     def __init__(self, env: Any):
         self.simulator = Simulator(env)
 

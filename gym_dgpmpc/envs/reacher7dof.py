@@ -268,7 +268,8 @@ class Reacher7DoFEnv(MujocoTask, utils.EzPickle):
         return np.concatenate([self.data.qpos, self.data.mocap_pos[0], self.data.qvel])
 
     def _get_reset_info(self) -> dict[str, float]:
-        terms = self.reward_fn.terms(torch.zeros(7), torch.from_numpy(self._get_obs()))
+        action = torch.zeros(7, dtype=torch.float32, device="cpu")
+        terms = self.reward_fn.terms(action, torch.from_numpy(self._get_obs()))
         return {"distance_to_target": float(terms.squared_distance.sqrt())}
 
 

@@ -20,6 +20,7 @@ from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.standardised import Data, DataSource, minibatch
 from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all, log_likelihood, propagate
 from gym_dgpmpc.inference import sghmc
+from gym_dgpmpc.inference.adam import adam_memory
 from gym_dgpmpc.inference.last_layer import last_layer_posterior
 from gym_dgpmpc.inference.sghmc import SGHMCState
 
@@ -120,6 +121,7 @@ class MCEM:
         self._parameters = [p.detach().clone().requires_grad_() for p in model.parameters()]
         self._live = model.with_parameters(self._parameters)
         self._optimiser = torch.optim.Adam(self._parameters, lr=settings.learning_rate)
+        self._optimiser.state.update({parameter: adam_memory(parameter) for parameter in self._parameters})
         self._window = chain.position.new_empty(settings.window_size, chain.position.numel())
         self.iteration = 0
         self.value = chain.position.new_zeros(())

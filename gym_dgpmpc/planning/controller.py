@@ -161,7 +161,7 @@ class Controller:
         if age == 0:
             deadline = None if self.time_budget is None else started + self.time_budget
             drawn = self.worlds(generator)() if worlds is None else worlds()
-            start = torch.as_tensor(task.start(observation), dtype=torch.float32, device=self.device)
+            start = task.start(observation).to(self.device)
             reward_fn, terminated_fn = task.planned[:2]
             assert reward_fn is not None
             objective = rollout_objective(drawn, reward_fn, start, self.num_particles, terminated_fn)
@@ -184,7 +184,7 @@ class Controller:
 
     def uniform(self, generator: torch.Generator) -> np.ndarray:
         """A uniformly random action, [A]."""
-        uniform = torch.rand(self._low.shape, generator=generator, device=self.device)
+        uniform = torch.rand(self._low.shape, generator=generator, dtype=torch.float32, device=self.device)
         return (self._low + (self._high - self._low) * uniform).cpu().numpy()
 
     def _check_planned(self, plan: Plan) -> None:

@@ -47,7 +47,7 @@ def plans_to_tensors(states: Sequence[PlanState]) -> dict[str, Tensor]:
     """The plans of n environments, on the CPU: each field as "plan.<field>" [n, ...], and "plan.age" [n]."""
     plans = [state.plan._asdict() for state in states]
     fields = {f"plan.{name}": torch.stack([plan[name] for plan in plans]).cpu() for name in plans[0]}
-    return fields | {AGE: torch.tensor([state.age for state in states], dtype=torch.int64)}
+    return fields | {AGE: torch.tensor([state.age for state in states], dtype=torch.int64, device="cpu")}
 
 
 def plans_from_tensors(

@@ -132,14 +132,14 @@ class ForecastCallback(BaseCallback):
 
     def _compare(self, episode: Episode, start: int) -> Forecast:
         """What the worlds drawn at a step predict for the actions taken from it, beside what happened."""
-        modelled = self.agent.task.modelled
+        task = self.agent.task
         actions = episode.actions[start : start + self.horizon].reshape(1, -1, episode.actions[0].size)
         predicted = rollout(
             self._worlds[start],
-            torch.as_tensor(modelled.start(episode.observations[start]), dtype=torch.float32, device=self.agent.device),
+            task.start(episode.observations[start]),
             torch.as_tensor(actions, dtype=torch.float32, device=self.agent.device),
             self.num_particles,
         )
         observed = episode.observations[start : start + actions.shape[1] + 1]
-        states = predicted[:, :, 0, : modelled.observation_size]
+        states = predicted[:, :, 0, : task.modelled.observation_size]
         return Forecast(start, states.cpu().numpy(), observed)

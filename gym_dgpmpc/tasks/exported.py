@@ -40,7 +40,7 @@ def arrays(store: TransitionStore, observation_space: spaces.Space, action_space
     """
     if not len(store):
         raise EnvironmentDataError("the store holds 0 transitions, so there is nothing to export: call learn first")
-    observation, action, after = (column.numpy() for column in store.transitions())
+    observation, action, after = (column.numpy() for column in store.exact_transitions())
     return {
         "observation": _in_space(observation, observation_space),
         "action": action.reshape(-1, *action_space.shape).astype(action_space.dtype),

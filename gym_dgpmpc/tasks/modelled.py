@@ -78,10 +78,10 @@ class ModelledVector:
         not_inputs = (*(i for i in spec.not_inputs if i not in inputs), *added)
         return replace(spec, absolute=(*spec.absolute, *added), not_inputs=not_inputs)
 
-    def transitions(self, store: TransitionStore) -> Transitions:
-        """The stored transitions as the model sees them."""
-        observation, action, after = store.transitions()
-        added = [store.rewards] * self.reward + [store.terminated.to(after.dtype)] * self.terminated
+    def transitions(self, store: TransitionStore, *, exact: bool = False) -> Transitions:
+        """The stored transitions as the model sees them; ``exact``: in the precision that they came in."""
+        observation, action, after = store.exact_transitions() if exact else store.transitions()
+        added = [store.rewards.to(after.dtype)] * self.reward + [store.terminated.to(after.dtype)] * self.terminated
         if not added:
             return Transitions(observation, action, after)
         column = torch.stack(added, dim=-1)

@@ -20,6 +20,7 @@ from numpy import ndarray
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from gym_dgpmpc.errors import CheckpointError, DGPMPCError, EnvironmentFailedError
+from gym_dgpmpc.tasks.actions import performed
 
 SIMULATORS = ("gymnasium.envs.", "gymnasium_robotics.", "gym_dgpmpc.")
 """Packages whose environments are known to be simulators."""
@@ -190,9 +191,9 @@ def replay(
         actions, next_observations, rewards: as they were stored.
     """
     observation: Any = None
-    shape = vec_env.action_space.shape or ()
+    assert isinstance(vec_env.action_space, gymnasium.spaces.Box)
     for step, action in enumerate(actions):
-        observation, reward, dones, _ = vec_env.step(action.reshape(1, *shape).copy())
+        observation, reward, dones, _ = vec_env.step(performed(action[None], vec_env.action_space))
         if dones[0]:
             return f"the episode ended at its step {step}"
         if not np.array_equal(np.asarray(observation[0], dtype=np.float32), next_observations[step]):

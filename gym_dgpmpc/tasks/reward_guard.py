@@ -12,16 +12,20 @@ to 3e-4 only."""
 
 
 @torch.no_grad()
-def disagreements(functions: TaskFunctions, store: TransitionStore, device: torch.device | str = "cpu") -> list[str]:
+def disagreements(
+    functions: TaskFunctions, store: TransitionStore, device: torch.device | str = "cpu", *, exact: bool = False
+) -> list[str]:
     """Where a task's functions and the stored transitions disagree, a message for each function; empty if nowhere.
 
-    A reward function that is meant to differ from what `step` returns is not compared.
+    With ``exact`` they are given the transitions in the precision that they came in. A reward function that is meant to
+    differ from what `step` returns is not compared.
     """
+    data = store.exact_transitions() if exact else store.transitions()
     # Copies: a function may write into what it is given.
-    observation, action, after = (tensor.clone().to(device) for tensor in store.transitions())
+    observation, action, after = (tensor.clone().to(device) for tensor in data)
     found = []
     if functions.reward_fn is not None and functions.is_reported:
-        planned, returned = functions.reward_fn(observation, action, after).cpu(), store.rewards
+        planned, returned = functions.reward_fn(observation, action, after).cpu().to(store.rewards), store.rewards
         limit = TOLERANCE * returned.abs().max().clamp(min=1e-3)
         bad = ~((planned - returned).abs() <= limit)
         found += _disagreement("reward_fn", planned.to(returned.dtype), returned, bad)

@@ -14,13 +14,15 @@ import torch
 from gymnasium import spaces
 from jaxtyping import Float
 from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
 
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import UnknownRewardError
 from gym_dgpmpc.tasks.environment import about_environment, describe, flat_size
-from gym_dgpmpc.tasks.first_batch import REWARD_SIGNATURE
+from gym_dgpmpc.tasks.first_batch import REWARD_SIGNATURE, example_batch
 from gym_dgpmpc.tasks.functions import LEARNED, Learned, Never, TaskFunctions, find_functions, find_observation_spec
 from gym_dgpmpc.tasks.modelled import ModelledVector
+from gym_dgpmpc.tasks.precision import hidden_changes, in_double, warn_of_hidden_changes
 from gym_dgpmpc.types import ObservationSpec, RewardFn, StateDict, TerminatedFn, Transitions
 
 MISSING_TERMINATION = (
@@ -48,6 +50,7 @@ class Task:
 
     Attributes:
         modelled: the vector that the model predicts: the observation, and reward and termination if they are learned.
+        is_exact: whether the model is given observations as float64, because float32 would hide their changes.
         can_model_more: whether a model can be made that predicts more; not of a ready-made one.
 
     Raises:
@@ -72,6 +75,7 @@ class Task:
         self._had_terminated_fn = False
         self._has_warned = False
         self.can_model_more = True
+        self.is_exact = False
         self.modelled = ModelledVector(
             flat_size(observation_space),
             find_observation_spec(env, given.observation_spec),
@@ -113,15 +117,46 @@ class Task:
         Raises:
             UnknownRewardError: as `functions`.
         """
-        return self.modelled.functions(self.functions)
+        return self.modelled.functions(self.functions_of_data)
 
-    def start(self, observation: Float[np.ndarray, "S"]) -> Float[np.ndarray, "S_all"]:
-        """The vector that a plan starts from."""
-        return self.modelled.start(observation)
+    @cached_property
+    def functions_of_data(self) -> TaskFunctions:
+        """`functions`, for observations in the precision that the model is given them in.
+
+        Raises:
+            UnknownRewardError: as `functions`.
+        """
+        if not self.is_exact:
+            return self.functions
+        tried = (tensor.double() for tensor in example_batch(*self._spaces, self._device))
+        return in_double(self.functions, Transitions(*tried))
+
+    def start(self, observation: Float[np.ndarray, "S"]) -> Float[Tensor, "S_all"]:
+        """The vector that a plan starts from, in the precision of the plan's states and on its device."""
+        dtype = torch.float64 if self.is_exact else torch.float32
+        return torch.from_numpy(self.modelled.start(observation)).to(self._device, dtype)
 
     def transitions(self, store: TransitionStore) -> Transitions:
         """The stored transitions as the model sees them."""
-        return self.modelled.transitions(store)
+        return self.modelled.transitions(store, exact=self.is_exact)
+
+    def look_at_precision(self, store: TransitionStore, *, takes_float64: bool) -> None:
+        """Before a training: go on in float64 if float32 hides how observations change, or warn that it does.
+
+        Args:
+            store: of all transitions.
+            takes_float64: whether the model may be given float64.
+        """
+        if self.is_exact:
+            return
+        data = store.exact_transitions()
+        if data.observation.dtype != torch.float64:
+            warn_of_hidden_changes(data, "give the observation space the dtype float64")
+        elif not takes_float64:
+            warn_of_hidden_changes(data, "this dynamics model has no attribute takes_float64 = True")
+        elif hidden_changes(data).any():
+            self.is_exact = True
+            self._forget_planned()
 
     def model(self, *, reward: bool, terminated: bool) -> None:
         """From now on the model predicts these beside the observation.
@@ -199,6 +234,7 @@ class Task:
             "reward": self.modelled.reward,
             "terminated": self.modelled.terminated,
             "to_learn": self.to_learn,
+            "is_exact": self.is_exact,
             "has_terminated_fn": has_terminated_fn or self.lacks_terminated_fn,
             "about_environment": self.about_environment(),
         }
@@ -220,8 +256,10 @@ class Task:
             raise ValueError(f"about_environment must be an object, got {about!r}")
         if (reward, terminated) != (self.modelled.reward, self.modelled.terminated):
             self.model(reward=reward, terminated=terminated)
+        self.is_exact = bool(state.get("is_exact", False))  # older files do not say
         self._loaded_about, self._had_terminated_fn = about, had_terminated_fn
         self._forget_planned()
 
     def _forget_planned(self) -> None:
-        self.__dict__.pop("planned", None)
+        for name in ("planned", "functions_of_data"):
+            self.__dict__.pop(name, None)

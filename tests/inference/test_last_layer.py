@@ -8,7 +8,8 @@ from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
 from gym_dgpmpc.gp.exact import whitened_posterior
 from gym_dgpmpc.gp.kernels import KERNELS
-from gym_dgpmpc.gp.layer import Layer
+from gym_dgpmpc.gp.layer import Layer, project
+from gym_dgpmpc.gp.linalg import JITTER
 from gym_dgpmpc.inference import mcem, sghmc
 from gym_dgpmpc.inference.last_layer import last_layer_posterior
 from gym_dgpmpc.inference.mcem import InferenceSettings
@@ -111,3 +112,43 @@ def test_repeated_draws_share_the_inner_layers(generator):
     inner = model.num_inner()
     assert (positions[:, :inner] == chain.position[:inner]).all()
     assert positions[:, inner:].std(0).min() > 0
+
+
+def test_draws_from_some_rows_count_for_all_data(generator):
+    """Where all rows are the same, any n of them with the weight N / n say what the N say."""
+    model, (x, y) = deep_gp(1, generator), toy(generator)
+    num_data, num_rows, num_samples = 64, 4, 20_000
+    data = Data(x[:1].repeat(num_data, 1), y[:1].repeat(num_data, 1))
+    factorised = factorise_all(model)
+    exact = whitened_posterior(model.layers[0], factorised.factors[0], model.noise_variance, *data)
+    settings = InferenceSettings(gibbs_rows=num_rows)
+    chain = sghmc.init(torch.zeros(M * T).double())
+    positions = mcem.gibbs_positions(factorised, chain, data, num_samples, generator, settings)
+    # What the data determine: the function's value at the only input, a . v for each target.
+    layer = model.layers[0]
+    a = (layer.variance.sqrt() * project(layer, factorised.factors[0], x[:1])).squeeze()
+    values = torch.einsum("m,nmt->nt", a, positions.unflatten(1, (M, T)))
+    variance = torch.einsum("m,tmk,k->t", a, exact.covariance, a)
+    # Five standard errors, of a mean and of a variance. Without the weight the variance is more than ten times this.
+    assert ((values.mean(0) - a @ exact.mean).abs() <= 5 * (variance / num_samples).sqrt()).all()
+    assert ((values.var(0) / variance - 1).abs() <= 5 * (2 / num_samples) ** 0.5).all()
+
+
+def test_the_last_layer_is_fed_what_the_inner_layers_give(generator):
+    """At its own inducing inputs an inner layer is its inducing outputs, so the last one's posterior is closed too."""
+    model = deep_gp(2, generator)
+    factorised = factorise_all(model)
+    inner, last = model.layers
+    x = inner.inducing_inputs
+    y = torch.stack([x[:, 0].sin(), x[:, 1].cos(), x.sum(-1)], dim=1)
+    whitened = 2.0 * torch.randn(model.num_whitened(), generator=generator, dtype=torch.float64)
+    outputs = factorised.factors[0] @ model.split(whitened)[0]
+    exact = whitened_posterior(last, factorised.factors[1], model.noise_variance, x + outputs, y)
+    found = last_layer_posterior(factorised, whitened, x, y, generator)
+    # The jitter leaves the inner layer's values a standard deviation of this; the posterior mean moves in proportion,
+    # by |y| / noise variance at most.
+    spread = float((JITTER * inner.variance).sqrt())
+    tolerance = 5 * spread * float(y.abs().max() / model.noise_variance.min())
+    torch.testing.assert_close(found.mean.mT, exact.mean, rtol=0, atol=tolerance)
+    unfed = whitened_posterior(last, factorised.factors[1], model.noise_variance, x, y)
+    assert (unfed.mean - exact.mean).abs().max() > 3 * tolerance

@@ -121,3 +121,28 @@ def test_the_prior_weighs_less_the_more_data_there_are():
     factorised, v = factorise_all(model), normal(seeded(1), model.num_whitened())
     values = [mcem.negative_log_joint(factorised, v, data, n, seeded()).item() for n in (8, 80)]
     assert values[0] - values[1] == pytest.approx(0.5 * v.square().sum().item() * (1 / 8 - 1 / 80), rel=1e-10)
+
+
+def test_hyperparameters_see_every_position_of_the_window_alike(monkeypatch):
+    model, data = one_layer()
+    size, num_steps = 4, 400
+    run = mcem.MCEM(
+        model, sghmc.init(normal(seeded(1), model.num_whitened())), data, InferenceSettings(window_size=size)
+    )
+    original, seen = mcem.negative_log_joint, []
+
+    def watched(factorised, whitened, batch, num_data, generator):
+        if not whitened.requires_grad:  # the M-step; the gradient of the E-step is the position's
+            seen.append(whitened.clone())
+        return original(factorised, whitened, batch, num_data, generator)
+
+    monkeypatch.setattr(mcem, "negative_log_joint", watched)
+    generator, counts = seeded(), torch.zeros(size)
+    for _ in range(size - 1):
+        run.step(generator)
+    seen.clear()
+    for _ in range(num_steps):
+        run.step(generator)
+        counts += (run.window == seen.pop()).all(dim=1)
+    assert counts.sum() == num_steps  # each was one of the window, and its rows differ
+    assert scipy.stats.chisquare(counts.numpy()).pvalue > 1e-4

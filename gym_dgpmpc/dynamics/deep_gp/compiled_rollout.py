@@ -6,6 +6,7 @@ The compiled code has kernels of its own, which it is asked for by name; one tha
 """
 
 import ctypes
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -115,6 +116,7 @@ class CompiledRollout:
             raise RuntimeError("no compiled code on this machine: check is_available() first")
         self._library, units = library, int(library.units())
         encoder, first = coordinates.encoder, layers[0]
+        self._coordinates = coordinates
         self._kept_alive: list[Tensor] = []  # the memory that the structures point into
         self._layers = (_Layer * len(layers))(*(self._packed(layer, units) for layer in layers))
         vectors = encoder.spec.body_frame
@@ -123,9 +125,9 @@ class CompiledRollout:
         inputs = [along_body.get(i, (AS_IS, i)) for i in encoder.plain]
         inputs += [(kind, i) for kind in (SINE, COSINE) for i in encoder.angles]
         inputs += [(ACTION, i) for i in range(encoder.action_size)]
-        target = torch.full((encoder.observation_size,), -1)
-        target[encoder.predicted] = torch.arange(encoder.target_size)
-        spread = torch.zeros(encoder.observation_size)
+        target = torch.full((encoder.observation_size,), -1, dtype=torch.int64, device="cpu")
+        target[encoder.predicted] = torch.arange(encoder.target_size, dtype=torch.int64, device="cpu")
+        spread = torch.zeros(encoder.observation_size, dtype=torch.float32, device="cpu")
         spread[encoder.predicted] = coordinates.spread
         self._task = _Task(
             observation_size=encoder.observation_size,
@@ -136,16 +138,16 @@ class CompiledRollout:
             num_inducing=_rounded_up(first.kernel_out.shape[-1], units),
             num_features=_rounded_up(first.feature_out.shape[-1], units),
             num_functions=first.kernel_out.shape[0],
-            input_kind=self._integers(torch.tensor([kind for kind, _ in inputs])),
-            input_source=self._integers(torch.tensor([source for _, source in inputs])),
+            input_kind=self._integers([kind for kind, _ in inputs]),
+            input_source=self._integers([source for _, source in inputs]),
             input_mean=self._floats(coordinates.input_mean),
             input_scale=self._floats(coordinates.input_scale),
             carried=self._floats(coordinates.carried),
             shift=self._floats(coordinates.shift),
             spread=self._floats(spread),
-            target=self._integers(target),
+            target=self._integers(target.tolist()),
             num_vectors=len(vectors),
-            vectors=self._integers(torch.tensor(vectors)),
+            vectors=self._integers(vectors),
             layers=self._layers,
         )
 
@@ -153,6 +155,8 @@ class CompiledRollout:
         self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]
     ) -> Float[Tensor, "H_plus_1 P K S"]:
         """The states of every particle under every candidate, the first of them ``observation``.
+
+        From a float64 observation the states are float64, and what is rounded is their distance from it alone.
 
         Runs on as many threads as PyTorch is set to use, and gives the same values for any number of them.
 
@@ -163,6 +167,12 @@ class CompiledRollout:
         self._check_sizes(observation, actions)
         num_candidates, horizon, _ = actions.shape
         task = _Task.from_buffer_copy(self._task)
+        origin = None
+        if observation.dtype == torch.float64:
+            origin = self._origin(observation)
+            moved = [tensor.float().contiguous() for tensor in self._about(origin)]
+            task.input_mean, task.shift = (_pointer(tensor) for tensor in moved)
+            observation = observation - origin
         start = observation.to(torch.float32).contiguous()
         actions = actions.to(torch.float32).contiguous()
         states = actions.new_empty(horizon + 1, task.num_particles, num_candidates, task.observation_size)
@@ -180,7 +190,22 @@ class CompiledRollout:
         failed = run(*ranges[0]) if len(ranges) == 1 else sum(_threads(threads).map(lambda r: run(*r), ranges))
         if failed:
             raise MemoryError("could not allocate the scratch space of a rollout, a few kilobytes for each thread")
-        return states
+        return states if origin is None else states + origin
+
+    def _origin(self, observation: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
+        """A place near the observation that states can be told from: of an angle whole turns, which change nothing."""
+        encoder, origin = self._coordinates.encoder, observation.clone()
+        turning = [*encoder.angles, *encoder.vectors.headings]
+        origin[turning] = 2 * math.pi * torch.round(observation[turning] / (2 * math.pi))
+        origin[[*encoder.vectors.x, *encoder.vectors.y]] = 0.0  # their lengths count, and not only their changes
+        return origin
+
+    def _about(self, origin: Float[Tensor, "S"]) -> tuple[Float[Tensor, "D"], Float[Tensor, "S"]]:
+        """Means of the inputs, and what is added to a state, where states are told from ``origin``."""
+        encoder = self._coordinates.encoder
+        mean, shift = self._coordinates.inputs.mean.clone(), self._coordinates.exact_shift
+        mean[: len(encoder.plain)] -= origin[encoder.plain]
+        return mean, shift - origin * (1.0 - encoder.carried)
 
     def _check_sizes(self, observation: Tensor, actions: Tensor) -> None:
         """Refuse wrong sizes: the compiled code trusts them, and would read beyond the arrays."""
@@ -219,8 +244,8 @@ class CompiledRollout:
         self._kept_alive.append(values.to(torch.float32).contiguous())
         return _pointer(self._kept_alive[-1])
 
-    def _integers(self, values: Tensor) -> "ctypes._Pointer[ctypes.c_int64]":
-        self._kept_alive.append(values.to(torch.int64).contiguous())
+    def _integers(self, values: Any) -> "ctypes._Pointer[ctypes.c_int64]":
+        self._kept_alive.append(torch.tensor(values, dtype=torch.int64, device="cpu"))
         return ctypes.cast(self._kept_alive[-1].data_ptr(), _Integers)
 
 

@@ -92,9 +92,11 @@ def _draw_layer(
     features = draw_features(layer.kernel, num_features, input_size, generator, dtype=scaled.dtype)
     columns = num_functions * num_particles * outputs
     # Normals are drawn in single precision, which is six times faster and ample for random numbers.
-    normals = torch.randn(num_features + num_inducing, columns, generator=generator, device=scaled.device)
+    shape = (num_features + num_inducing, columns)
+    normals = torch.randn(shape, generator=generator, dtype=torch.float32, device=scaled.device)
     sigma = layer.variance.sqrt()
-    prior = sigma * torch.cat([features(scaled), JITTER**0.5 * torch.eye(num_inducing).to(scaled)], dim=1)
+    identity = torch.eye(num_inducing, dtype=torch.float32, device=scaled.device)
+    prior = sigma * torch.cat([features(scaled), (JITTER**0.5 * identity).to(scaled)], dim=1)
     known = torch.linalg.solve_triangular(factor.mT, whitened.movedim(0, 1).flatten(1), upper=True)
     if columns < len(normals):
         response = torch.cholesky_solve(prior @ normals.to(scaled.dtype), factor)
@@ -218,7 +220,18 @@ class CompiledPathwiseSampler(PathwiseSampler):
         self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]
     ) -> Float[Tensor, "H_plus_1 P K S"]:
         """The states of every particle under every candidate; see `CompiledRollout`."""
+        if observation.dtype == torch.float64 and self.coordinates.encoder.spec.body_frame:
+            return self._step_by_step(observation, actions)  # a vector far from zero cannot be turned in float32
         return self._rollout(observation, actions)
+
+    def _step_by_step(
+        self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]
+    ) -> Float[Tensor, "H_plus_1 P K S"]:
+        num_particles = self.layers[0].kernel_out.shape[1]
+        states = [observation.expand(num_particles, len(actions), -1)]
+        for step, action in enumerate(actions.unbind(1)):
+            states.append(self(states[-1], action, step))
+        return torch.stack(states)
 
 
 class _Buffers(NamedTuple):

@@ -233,7 +233,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             return {"resamplings_dropped": 1.0}
         if not training.is_plausible(newest):
             return {"resamplings_dropped": 1.0}
-        rows = (fitted.oldest + torch.arange(len(newest))) % self.num_samples
+        rows = (fitted.oldest + torch.arange(len(newest), dtype=torch.int64, device=self.device)) % self.num_samples
         fitted.pool[rows] = newest
         self._fitted = fitted._replace(chain=chain, oldest=(fitted.oldest + len(newest)) % self.num_samples)
         return {"resamplings_dropped": 0.0}

@@ -27,6 +27,7 @@ from gym_dgpmpc.dynamics.ensemble.network import (
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.state import take_normaliser, take_tensors
+from gym_dgpmpc.inference.adam import adam_memory
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
 
@@ -125,7 +126,7 @@ class EnsembleDynamics(Learner[_Fitted]):
             ValueError: there are no transitions.
         """
         raw, targets = self._encode(data)
-        inputs = Normaliser.fit(raw)
+        inputs = Normaliser.fit(raw, precision=data.observation.dtype)
         x, y = inputs(raw).float(), targets.float()
         if self._fitted is None:
             network = initial_ensemble(self.num_members, self.sizes, generator, self.device)
@@ -237,14 +238,11 @@ class EnsembleDynamics(Learner[_Fitted]):
         ]
         groups.append({"params": [*network.biases, network.max_logvar, network.min_logvar]})
         adam = torch.optim.Adam(groups, lr=self.learning_rate)
-        for name, pair in moments.items():
-            first, second = (moment.clone() for moment in pair)
-            adam.state[parameters[name]] = {
-                "step": torch.tensor(float(num_updates)), "exp_avg": first, "exp_avg_sq": second,
-            }  # fmt: skip
+        for name, parameter in parameters.items():
+            adam.state[parameter] = adam_memory(parameter, num_updates, moments.get(name))
         rows = torch.randint(len(x), (self.num_members, len(x)), generator=generator, device=x.device)
         for epoch in range(self.num_epochs):
-            order = torch.rand(rows.shape, generator=generator, device=x.device).argsort(1)
+            order = torch.rand(rows.shape, generator=generator, dtype=torch.float32, device=x.device).argsort(1)
             losses = []
             for batch in rows.gather(1, order).split(self.batch_size, dim=1):
                 with torch.enable_grad():

@@ -63,12 +63,14 @@ def initial_ensemble(
     """Weights from a normal of standard deviation 1 / (2 sqrt(inputs)), cut off at twice that; biases zero."""
     weights = []
     for inputs, outputs in sizes:
-        weight = torch.empty(num_members, inputs, outputs, device=device)
+        weight = torch.empty(num_members, inputs, outputs, dtype=torch.float32, device=device)
         std = 0.5 * inputs**-0.5
         weights.append(torch.nn.init.trunc_normal_(weight, 0.0, std, -2 * std, 2 * std, generator=generator))
-    biases = [torch.zeros(num_members, 1, outputs, device=device) for _, outputs in sizes]
+    biases = [torch.zeros(num_members, 1, outputs, dtype=torch.float32, device=device) for _, outputs in sizes]
     num_targets = sizes[-1][1] // 2
-    bounds = (torch.full((num_targets,), bound, device=device) for bound in (MAX_LOGVAR, MIN_LOGVAR))
+    bounds = (
+        torch.full((num_targets,), bound, dtype=torch.float32, device=device) for bound in (MAX_LOGVAR, MIN_LOGVAR)
+    )
     return Ensemble(tuple(weights), tuple(biases), *bounds)
 
 

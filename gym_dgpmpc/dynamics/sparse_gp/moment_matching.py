@@ -140,7 +140,7 @@ class MomentMatchingSampler:
         across = torch.zeros_like(covariance)
         across[:, :, predicted] = self._carried.unsqueeze(-1) * cross
         next_covariance = next_covariance + across + across.mT
-        rows = torch.tensor(predicted, device=mean.device)
+        rows = torch.tensor(predicted, dtype=torch.int64, device=mean.device)
         next_covariance[:, rows.unsqueeze(-1), rows] += change
         return next_mean, 0.5 * (next_covariance + next_covariance.mT)
 

@@ -1,5 +1,6 @@
 """Compiled rollouts against the same functions evaluated step by step with PyTorch, in single and double precision."""
 
+import math
 import os
 import subprocess
 import sys
@@ -36,7 +37,7 @@ pytestmark = pytest.mark.skipif(not compiled_rollout.is_available(), reason="no 
 class Draw:
     """The same functions, drawn from the same generator, as compiled code and as PyTorch in two precisions."""
 
-    def __init__(self, kernel, num_layers, spec=SPECS[1], refresh="step", num_inducing=13, num_features=21):
+    def __init__(self, kernel, num_layers, spec=SPECS[1], refresh="step", num_inducing=13, num_features=21, offset=0.0):
         generator = seeded(3)
         encoder = Encoder(3, 2, spec)
         # Small steps: the rounding of one step is not to be amplified much by the next ones.
@@ -44,6 +45,8 @@ class Draw:
             Normaliser(0.1 * normal(generator, size), 0.8 + 0.1 * normal(generator, size).square())
             for size in (encoder.input_size, encoder.target_size)
         )
+        inputs.mean[: len(encoder.plain)] += (torch.zeros(3).double() + offset)[encoder.plain]
+        targets.mean.add_(((torch.zeros(3).double() + offset) * (1.0 - encoder.carried))[encoder.predicted])
         model = make_model(num_layers, encoder.input_size, encoder.target_size, num_inducing, generator)
         names = kernel if isinstance(kernel, tuple) else (kernel,) * num_layers
         layers = zip(model.layers, names, strict=True)
@@ -212,7 +215,19 @@ def test_the_argument_may_be_a_view_of_another_precision():
     actions = draw.actions(8)
     expected = draw.compiled.trajectories(draw.observation, actions)
     strided = torch.stack([actions, actions], dim=-1).double()[..., 0]
-    assert torch.equal(draw.compiled.trajectories(draw.observation.double(), strided), expected)
+    assert torch.equal(draw.compiled.trajectories(draw.observation, strided), expected)
+
+
+@pytest.mark.parametrize("spec", SPECS[:3])
+def test_float64_states_far_from_zero_are_as_exact_as_near_it(spec):
+    offset = torch.tensor([1e6, 2 * math.pi * 1e6, 5e5], dtype=torch.float64)
+    draw = Draw("matern32", 2, spec, offset=offset)
+    observation, actions = draw.observation.double() + offset, draw.actions(20)
+    for sampler in (draw.compiled, draw.single):
+        found = rollout(sampler, observation, actions, PARTICLES)
+        assert found.dtype == torch.float64 and torch.equal(found[0], observation.expand_as(found[0]))
+        stepped = torch.stack([draw.double(found[t], actions[:, t].double(), t) for t in range(HORIZON)])
+        assert (found[1:] - stepped).abs().max() < 1e-5  # as near zero; float32 rounds 1e6 by 0.03
 
 
 @pytest.mark.parametrize(
