@@ -69,6 +69,11 @@ def model_settings(agent: MadeOf) -> dict[str, Setting]:
     return {} if agent.dynamics_class is None else settings_of(agent.dynamics_class)
 
 
+def setting_property(name: str) -> property:
+    """A setting as an attribute of the agent; it is decided when the agent is made, so it cannot be set."""
+    return property(lambda agent: agent.composition.setting(name))
+
+
 class Composition:
     """How one agent is made.
 

@@ -34,6 +34,7 @@ from gym_dgpmpc.agents.composition import (
     PlanningArguments,
     own_settings,
     part_settings,
+    setting_property,
 )
 from gym_dgpmpc.agents.episode import EpisodeRecord
 from gym_dgpmpc.agents.logs import Logs
@@ -160,7 +161,7 @@ class MPCAgent(BaseAlgorithm):
             cls.__doc__ = composed_documentation(cls, *parts)
             for name in joined(*parts[1:]):
                 if name != "learning_rate":  # SB3 has an attribute of that name
-                    setattr(cls, name, _property(name))
+                    setattr(cls, name, setting_property(name))
 
     def __init__(
         self,
@@ -882,7 +883,7 @@ class MPCAgent(BaseAlgorithm):
         raise NotImplementedError(f"to take over what another agent has learned use {type(self).__name__}.load(path)")
 
     @property
-    def planner_given(self) -> str | PlannerFactory | Planner:
+    def planner_given(self) -> AnyPlanner:
         """The planner as the constructor was given it."""
         return self.composition.planner
 
@@ -918,11 +919,6 @@ class MPCAgent(BaseAlgorithm):
 
 
 MPCAgent.__signature__ = composed_signature(MPCAgent, MPCAgent.own_settings())  # type: ignore[attr-defined]
-
-
-def _property(name: str) -> property:
-    """A setting, to be read on the agent; it is decided when the agent is made."""
-    return property(lambda agent: agent.composition.setting(name))
 
 
 def _as_callbacks(callback: MaybeCallback) -> list[BaseCallback]:

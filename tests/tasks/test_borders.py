@@ -99,7 +99,7 @@ def small_planner(action_low, action_high):
     return CEM(action_low, action_high, horizon=2, num_candidates=6, num_elites=2, num_iterations=1)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     parts=st.sampled_from([None, ("b", "a"), ("achieved_goal", "desired_goal", "observation")]),
     length=st.integers(1, SPAN),
