@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gym_dgpmpc.checks import check_counts
@@ -22,6 +22,7 @@ from gym_dgpmpc.dynamics.ensemble.network import (
     initial_ensemble,
     layer_sizes,
     loss,
+    misfit,
     predict,
 )
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
@@ -45,6 +46,20 @@ class _Fitted(NamedTuple):
     num_updates: int  # Adam steps over all trainings
 
 
+class _Best(NamedTuple):
+    """The epoch of a training after which held-out data were likeliest, and the networks then."""
+
+    misfit: float
+    epoch: int
+    parameters: dict[str, Tensor]
+    moments: dict[str, _Moments]
+    num_updates: int
+
+
+HELD_OUT = 0.1
+"""The share of the transitions that ``patience`` holds out."""
+
+
 class EnsembleDynamics(Learner[_Fitted]):
     """Implements `DynamicsModel` with an ensemble of B probabilistic networks.
 
@@ -62,7 +77,9 @@ class EnsembleDynamics(Learner[_Fitted]):
             hidden layers; the loss holds decay / 2 |W|^2.
         learning_rate: learning rate of Adam.
         batch_size: transitions in a minibatch of each network.
-        num_epochs: passes over the data in each training.
+        num_epochs: passes over the data in each training; with ``patience`` the most of them.
+        patience: epochs in a row without a better likelihood of held-out transitions, a tenth of all, after which
+            training stops and the networks of the best epoch are taken; None trains all epochs on all data.
         draw: how particles move through the networks: "TS1", each through one drawn anew at each step; "TSinf", each
             through its own for the whole plan; "DS", each by its own draw from the mean and variance of all; "MM", as
             DS, then a candidate's particles are replaced by draws from their mean and variance; "expectation", along
@@ -92,6 +109,7 @@ class EnsembleDynamics(Learner[_Fitted]):
         learning_rate: float = 1e-3,
         batch_size: int = 32,
         num_epochs: int = 5,
+        patience: int | None = None,
         draw: Propagation = "TSinf",
         half_precision: bool = False,
         dtype: torch.dtype = torch.float32,
@@ -104,6 +122,8 @@ class EnsembleDynamics(Learner[_Fitted]):
             batch_size=batch_size,
             num_epochs=num_epochs,
         )
+        if patience is not None:
+            check_counts(patience=patience)
         if len(weight_decay) != num_hidden_layers + 1 or not all(0 <= decay < math.inf for decay in weight_decay):
             raise ValueError(
                 f"weight_decay must hold one number of at least 0 for each layer: {num_hidden_layers} for the hidden "
@@ -115,7 +135,7 @@ class EnsembleDynamics(Learner[_Fitted]):
             raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(PROPAGATIONS)}")
         super().__init__(observation_size, action_size, observation_spec, dtype, device)
         self.num_members, self.weight_decay, self.learning_rate = num_members, tuple(weight_decay), learning_rate
-        self.batch_size, self.num_epochs, self.draw_kind = batch_size, num_epochs, draw
+        self.batch_size, self.num_epochs, self.patience, self.draw_kind = batch_size, num_epochs, patience, draw
         self.sizes = layer_sizes(self.encoder.input_size, num_hidden_layers, hidden_size, self.encoder.target_size)
         self.half_precision = half_precision
 
@@ -228,7 +248,7 @@ class EnsembleDynamics(Learner[_Fitted]):
         y: Float[Tensor, "N T"],
         generator: torch.Generator,
     ) -> tuple[_Fitted, float]:
-        """Every member's own bootstrap, shuffled for each epoch; the mean loss of the last epoch."""
+        """Every member's own bootstrap, shuffled for each epoch; the mean loss of the last epoch that was done."""
         parameters = {name: value.clone().requires_grad_() for name, value in network.parameters().items()}
         network = Ensemble.from_parameters(parameters)
         # Adam's own decay adds decay * W to the gradient, the gradient of decay / 2 |W|^2, without a pass of its own.
@@ -240,7 +260,9 @@ class EnsembleDynamics(Learner[_Fitted]):
         adam = torch.optim.Adam(groups, lr=self.learning_rate)
         for name, parameter in parameters.items():
             adam.state[parameter] = adam_memory(parameter, num_updates, moments.get(name))
-        rows = torch.randint(len(x), (self.num_members, len(x)), generator=generator, device=x.device)
+        learned, held_out = self._split(len(x), generator)
+        chosen = torch.randint(len(learned), (self.num_members, len(learned)), generator=generator, device=x.device)
+        rows, best = learned[chosen], _Best(math.inf, 0, {}, {}, num_updates)
         for epoch in range(self.num_epochs):
             order = torch.rand(rows.shape, generator=generator, dtype=torch.float32, device=x.device).argsort(1)
             losses = []
@@ -254,12 +276,26 @@ class EnsembleDynamics(Learner[_Fitted]):
                 num_updates += 1
             if self.on_progress is not None:
                 self.on_progress(epoch + 1, self.num_epochs, float(torch.stack(losses).mean()))
-        trained = Ensemble.from_parameters({name: value.detach() for name, value in parameters.items()})
-        moments = {
-            name: _Moments(adam.state[value]["exp_avg"], adam.state[value]["exp_avg_sq"])
-            for name, value in parameters.items()
-        }
-        return _Fitted(trained, inputs, moments, num_updates), float(torch.stack(losses).mean())
+            if held_out is None:
+                continue
+            with torch.no_grad():
+                tested = float(misfit(network, *(t[held_out].expand(self.num_members, -1, -1) for t in (x, y))).mean())
+            if tested < best.misfit:
+                best = _Best(tested, epoch, *_copies(parameters, adam), num_updates)
+            if epoch - best.epoch == self.patience:
+                break
+        if held_out is None or not best.parameters:  # no epoch was better than none: its loss was not finite
+            best = _Best(math.nan, epoch, *_copies(parameters, adam), num_updates)
+        trained = Ensemble.from_parameters(best.parameters)
+        return _Fitted(trained, inputs, best.moments, best.num_updates), float(torch.stack(losses).mean())
+
+    def _split(self, num_rows: int, generator: torch.Generator) -> tuple[Int[Tensor, "n"], Int[Tensor, "h"] | None]:
+        """Rows to learn from, and those held out; None where nothing is, for want of patience or of rows."""
+        count = int(HELD_OUT * num_rows)
+        if self.patience is None or count == 0:
+            return torch.arange(num_rows, dtype=torch.int64, device=self.device), None
+        order = torch.randperm(num_rows, generator=generator, device=self.device)
+        return order[count:], order[:count]
 
     def _shapes(self) -> dict[str, tuple[int, ...]]:
         """The shape of every parameter."""
@@ -268,6 +304,17 @@ class EnsembleDynamics(Learner[_Fitted]):
             shapes[f"layers.{i}.weight"] = (self.num_members, inputs, outputs)
             shapes[f"layers.{i}.bias"] = (self.num_members, 1, outputs)
         return shapes | dict.fromkeys(("max_logvar", "min_logvar"), (self.encoder.target_size,))
+
+
+def _copies(
+    parameters: Mapping[str, Tensor], adam: torch.optim.Optimizer
+) -> tuple[dict[str, Tensor], dict[str, _Moments]]:
+    """The parameters as they are now, and what Adam remembers of them."""
+    moments = {
+        name: _Moments(adam.state[value]["exp_avg"].clone(), adam.state[value]["exp_avg_sq"].clone())
+        for name, value in parameters.items()
+    }
+    return {name: value.detach().clone() for name, value in parameters.items()}, moments
 
 
 def _unit(size: int, device: torch.device) -> Normaliser:

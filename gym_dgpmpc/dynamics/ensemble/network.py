@@ -116,6 +116,10 @@ def loss(ensemble: Ensemble, x: Float[Tensor, "B n D"], y: Float[Tensor, "B n T"
 
     the first term twice the negative log likelihood of a target, up to a constant.
     """
+    return misfit(ensemble, x, y).sum() + BOUND_PENALTY * (ensemble.max_logvar.sum() - ensemble.min_logvar.sum())
+
+
+def misfit(ensemble: Ensemble, x: Float[Tensor, "B n D"], y: Float[Tensor, "B n T"]) -> Float[Tensor, "B"]:
+    """Twice each member's mean negative log likelihood of a target, up to a constant."""
     mean, logvar = predict(ensemble, x)
-    fit = ((y - mean).square() * torch.exp(-logvar) + logvar).mean((-2, -1)).sum()
-    return fit + BOUND_PENALTY * (ensemble.max_logvar.sum() - ensemble.min_logvar.sum())
+    return ((y - mean).square() * torch.exp(-logvar) + logvar).mean((-2, -1))

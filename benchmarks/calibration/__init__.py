@@ -1,0 +1,1 @@
+"""How well models know what they do not know, on recorded episodes: `python -m benchmarks.calibration`."""

@@ -1,0 +1,59 @@
+"""One model on one seed of a task: trained on 1, 2 and 4 of its episodes, tested on others after each.
+
+As in learning, a model goes on from its last training. Tested is the episode that came next in the learning run ("on
+the policy"), and two of random actions that were never learned from ("off").
+"""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.calibration.episodes import DATA, SMOOTH, WHITE, load, observation_spec, spread
+from benchmarks.calibration.models import NETWORKS, Make
+from benchmarks.calibration.scores import forecast, scores
+from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
+
+HORIZONS = {"cartpole": (1, 10, 20), "pendulum": (1, 10, 20), "reacher": (1, 10, 20), "cheetah": (1, 10, 20, 40)}
+
+TESTED_AFTER = (1, 2, 4)
+
+
+def measure(
+    make: Make, task: str, seed: int, episodes: tuple[int, ...] = TESTED_AFTER, data: Path = DATA, **settings: Any
+) -> list[dict[str, Any]]:
+    """A row of scores for each number of episodes, test and horizon."""
+    recording, spec, unit = load(task, seed, data), observation_spec(task), spread(task, data)
+    sizes = recording.observation.shape[-1], recording.action.shape[-1]
+    if getattr(make, "func", None) is EnsembleDynamics:
+        settings = {**NETWORKS.get(task, {}), **settings}
+    model, generator = make(*sizes, spec, **settings), torch.Generator().manual_seed(seed)
+    predicted = [i for i in range(sizes[0]) if spec is None or i not in spec.constant]
+    rows: list[dict[str, Any]] = []
+    seconds = 0.0
+    for count in range(1, max(episodes) + 1):
+        started = time.process_time()
+        metrics = model.fit(recording.transitions(range(count)), generator)
+        seconds += time.process_time() - started
+        if count not in episodes:
+            continue
+        for name, tested in (("on", [count]), ("off", [WHITE, SMOOTH])):
+            by_horizon: dict[int, list[tuple[torch.Tensor, torch.Tensor]]] = {}
+            started = time.process_time()
+            for episode in tested:
+                drawn, truth = forecast(
+                    model, recording.observation[episode], recording.action[episode], HORIZONS[task], generator
+                )
+                for horizon in drawn:
+                    by_horizon.setdefault(horizon, []).append((drawn[horizon], truth[horizon]))
+            for horizon, pairs in by_horizon.items():
+                particles = torch.cat([pair[0] for pair in pairs], dim=1) / unit
+                truths = torch.cat([pair[1] for pair in pairs]) / unit
+                about = {"task": task, "seed": seed, "episodes": count, "test": name, "horizon": horizon}
+                rows.append(
+                    about
+                    | scores(particles[..., predicted], truths[..., predicted])
+                    | {"fit_seconds": seconds, "noise_std": float(metrics.get("noise_std", float("nan")))}
+                )
+    return rows
