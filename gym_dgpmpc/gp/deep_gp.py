@@ -2,7 +2,8 @@
 
 f = f_L o ... o f_1 with sparse whitened layers (`layer.py`). Inner layers map the input space to itself with an
 identity mean; the last maps to the targets with mean zero (Salimbeni and Deisenroth 2017). `inference/` samples the
-inducing outputs and fits the hyperparameters of what is defined here; `dynamics/` makes a transition model of it.
+inducing outputs and the hyperparameters of what is defined here; `dynamics/` makes a transition model of it. As in
+`layer.py`, a leading axis "C" stands for the models of C chains.
 """
 
 import math
@@ -10,7 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gym_dgpmpc.gp.layer import PARAMETERS, Layer, conditional, factorise
@@ -26,34 +27,36 @@ class DeepGP(NamedTuple):
     """
 
     layers: tuple[Layer, ...]
-    log_noise: Float[Tensor, "T"]
+    log_noise: Float[Tensor, "*c T"]
 
     @property
-    def noise_variance(self) -> Float[Tensor, "T"]:
+    def noise_variance(self) -> Float[Tensor, "*c T"]:
         return NOISE_FLOOR + self.log_noise.exp()
 
     def output_sizes(self) -> list[int]:
         """Outputs of each layer: D for the inner ones, T for the last."""
-        inner = [layer.inducing_inputs.shape[1] for layer in self.layers[:-1]]
-        return [*inner, self.log_noise.numel()]
+        inner = [layer.inducing_inputs.shape[-1] for layer in self.layers[:-1]]
+        return [*inner, self.log_noise.shape[-1]]
+
+    def whitened_shapes(self) -> list[tuple[int, int]]:
+        """(M_l, O_l) of each layer's whitened inducing outputs."""
+        return [
+            (layer.inducing_inputs.shape[-2], size) for layer, size in zip(self.layers, self.output_sizes(), strict=True)
+        ]
 
     def split(self, whitened: Float[Tensor, "*p V"]) -> list[Tensor]:
         """The layers' whitened inducing outputs v_l "*p M_l O_l" as views of one flat vector, as inference keeps it."""
-        shapes = [
-            (layer.inducing_inputs.shape[0], size) for layer, size in zip(self.layers, self.output_sizes(), strict=True)
-        ]
+        shapes = self.whitened_shapes()
         by_layer = whitened.split([m * o for m, o in shapes], dim=-1)
         return [flat.unflatten(-1, shape) for flat, shape in zip(by_layer, shapes, strict=True)]
 
     def num_whitened(self) -> int:
         """V, the length of the flat vector of all whitened inducing outputs."""
-        return sum(
-            layer.inducing_inputs.shape[0] * o for layer, o in zip(self.layers, self.output_sizes(), strict=True)
-        )
+        return sum(m * o for m, o in self.whitened_shapes())
 
     def num_inner(self) -> int:
         """How many of them belong to the inner layers, which come first."""
-        return self.num_whitened() - self.layers[-1].inducing_inputs.shape[0] * self.log_noise.numel()
+        return sum(m * o for m, o in self.whitened_shapes()[:-1])
 
     def parameters(self) -> list[Tensor]:
         """The tensors that the hyperparameter optimiser moves."""
@@ -64,6 +67,10 @@ class DeepGP(NamedTuple):
         each = iter(parameters)
         layers = tuple(Layer(layer.kernel, *(next(each) for _ in PARAMETERS)) for layer in self.layers)
         return DeepGP(layers, next(each))
+
+    def at(self, chain: Int[Tensor, "n"]) -> "DeepGP":
+        """The models of these chains, the same one more than once if need be."""
+        return self.with_parameters([tensor[chain] for tensor in self.parameters()])
 
     def detach(self) -> "DeepGP":
         return self.with_parameters([tensor.detach() for tensor in self.parameters()])
@@ -76,7 +83,7 @@ class Factorised(NamedTuple):
     """
 
     model: DeepGP
-    factors: list[Float[Tensor, "M M"]]
+    factors: list[Float[Tensor, "*c M M"]]
 
     def detach(self) -> "Factorised":
         """The same with hyperparameters that are constants."""
@@ -126,5 +133,5 @@ def log_likelihood(
     target: Float[Tensor, "n T"],
 ) -> Float[Tensor, "*p n"]:
     """log N(y | mean, variance + noise), summed over the independent targets: the last layer integrated out."""
-    total = variance.unsqueeze(-1) + model.noise_variance
+    total = variance.unsqueeze(-1) + model.noise_variance.unsqueeze(-2)
     return -0.5 * ((target - mean).square() / total + total.log() + math.log(2 * math.pi)).sum(-1)

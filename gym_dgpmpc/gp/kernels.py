@@ -222,13 +222,13 @@ def find_kernel(kernel: str | Kernel) -> Kernel:
 
 
 def scaled_sqdist(
-    x: Float[Tensor, "*b n D"], z: Float[Tensor, "m D"], lengthscale: Float[Tensor, "D"]
+    x: Float[Tensor, "*b n D"], z: Float[Tensor, "*c m D"], lengthscale: Float[Tensor, "*c D"]
 ) -> Float[Tensor, "*b n m"]:
     """r^2 between the rows of ``x`` and ``z``; may be negative by rounding."""
-    return sqdist(x / lengthscale, z / lengthscale)
+    return sqdist(x / lengthscale.unsqueeze(-2), z / lengthscale.unsqueeze(-2))
 
 
-def sqdist(x: Float[Tensor, "*b n D"], z: Float[Tensor, "m D"]) -> Float[Tensor, "*b n m"]:
+def sqdist(x: Float[Tensor, "*b n D"], z: Float[Tensor, "*c m D"]) -> Float[Tensor, "*b n m"]:
     """|x_i - z_j|^2 between the rows of ``x`` and ``z``; may be negative by rounding.
 
     One matrix product of (x, |x|^2, 1) and (-2 z, 1, |z|^2), so that no other operation has the size of the result.

@@ -2,6 +2,9 @@
 
 `deep_gp.py` composes layers; training differentiates through `conditional`, the draws of a trained model reuse
 `factorise`. All outputs of a layer share one ARD kernel, so one factorisation serves them all.
+
+A layer may stand for C layers side by side, those of C chains: every tensor then has a leading axis "C", which the
+points have too, before their own.
 """
 
 from typing import NamedTuple
@@ -19,9 +22,9 @@ class Layer(NamedTuple):
     """Kernel, its hyperparameters theta, and inducing inputs Z of one layer."""
 
     kernel: Kernel
-    inducing_inputs: Float[Tensor, "M D"]
-    log_lengthscale: Float[Tensor, "D"]
-    log_variance: Float[Tensor, ""]
+    inducing_inputs: Float[Tensor, "*c M D"]
+    log_lengthscale: Float[Tensor, "*c D"]
+    log_variance: Float[Tensor, "*c"]
 
     @property
     def lengthscale(self) -> Tensor:
@@ -45,7 +48,7 @@ def parameter_shapes(num_inducing: int, input_size: int) -> dict[str, tuple[int,
     return dict(zip(PARAMETERS, ((num_inducing, input_size), (input_size,), ()), strict=True))
 
 
-def factorise(layer: Layer) -> Float[Tensor, "M M"]:
+def factorise(layer: Layer) -> Float[Tensor, "*c M M"]:
     """L_z, the lower Cholesky factor of K_zz + jitter.
 
     Raises:
@@ -53,12 +56,12 @@ def factorise(layer: Layer) -> Float[Tensor, "M M"]:
     """
     z = layer.inducing_inputs
     unit = layer.kernel.correlation(scaled_sqdist(z, z, layer.lengthscale))
-    return layer.variance.sqrt() * cholesky(unit, torch.ones_like(layer.log_variance))
+    return _matrix(layer.variance.sqrt()) * cholesky(unit, unit.new_ones(()))
 
 
 def conditional(
     layer: Layer,
-    factor: Float[Tensor, "M M"],
+    factor: Float[Tensor, "*c M M"],
     whitened: Float[Tensor, "*p M O"],
     x: Float[Tensor, "*p n D"],
 ) -> tuple[Float[Tensor, "*p n O"], Float[Tensor, "*p n"]]:
@@ -68,30 +71,35 @@ def conditional(
     """
     projected = project(layer, factor, x)
     # The kernel's variance enters here and not in the large matrix, which training differentiates through.
-    variance = layer.variance * (1.0 - projected.square().sum(-2))
-    return layer.variance.sqrt() * (projected.mT @ whitened), variance.clamp_min(0.0)
+    variance = layer.variance.unsqueeze(-1) * (1.0 - projected.square().sum(-2))
+    return _matrix(layer.variance.sqrt()) * (projected.mT @ whitened), variance.clamp_min(0.0)
 
 
 def joint_conditional(
     layer: Layer,
-    factor: Float[Tensor, "M M"],
+    factor: Float[Tensor, "*c M M"],
     whitened: Float[Tensor, "*p M O"],
     x: Float[Tensor, "*p n D"],
 ) -> tuple[Float[Tensor, "*p n O"], Float[Tensor, "*p n n"]]:
     """As `conditional`, with the full covariance of the n points: k_xx' - k_xz K_zz^-1 k_zx'."""
     projected = project(layer, factor, x)
-    prior = layer.kernel.correlation(pairwise_sqdist(x / layer.lengthscale))
-    covariance = layer.variance * (prior - projected.mT @ projected)
-    return layer.variance.sqrt() * (projected.mT @ whitened), covariance
+    prior = layer.kernel.correlation(pairwise_sqdist(x / layer.lengthscale.unsqueeze(-2)))
+    covariance = _matrix(layer.variance) * (prior - projected.mT @ projected)
+    return _matrix(layer.variance.sqrt()) * (projected.mT @ whitened), covariance
 
 
-def project(layer: Layer, factor: Float[Tensor, "M M"], x: Float[Tensor, "*p n D"]) -> Float[Tensor, "*p M n"]:
+def project(layer: Layer, factor: Float[Tensor, "*c M M"], x: Float[Tensor, "*p n D"]) -> Float[Tensor, "*p M n"]:
     """L_z^-1 k_zx / sigma, of which every column has a length of at most one.
 
     Args:
         factor: `factorise` of this very layer. Gradients with respect to the layer are complete without any flowing
             through the factor; it may have been computed without gradients.
     """
-    lengthscale = layer.lengthscale
-    unit = (factor / layer.variance.sqrt()).detach()
+    lengthscale = layer.lengthscale.unsqueeze(-2)
+    unit = (factor / _matrix(layer.variance.sqrt())).detach()
     return projection(layer.kernel, x / lengthscale, layer.inducing_inputs / lengthscale, unit)
+
+
+def _matrix(scale: Float[Tensor, "*c"]) -> Float[Tensor, "*c 1 1"]:
+    """In the shape that multiplies a matrix of each chain."""
+    return scale[..., None, None]

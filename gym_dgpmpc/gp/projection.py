@@ -44,12 +44,12 @@ class _Projection(torch.autograd.Function):
             # First z_j in its distances to the points: d |x_i - z_j|^2 / d z_j = 2 (z_j - x_i), summed over the i.
             points = by_distance.sum(-2).unsqueeze(-1) * z - by_distance.mT @ x
             outer = gradient @ projected.mT  # A_bar A^T, through which the factor's gradient comes
-            leading = tuple(range(gradient.ndim - 2))
+            leading = tuple(range(gradient.ndim - z.ndim))
             if leading:  # one factor serves all particles, so their gradients add up
                 points, outer = points.sum(leading), outer.sum(leading)
             # Then in K_zz: Phi, L^-T from the left and L^-1 from the right, and the symmetric part of it.
             lower = outer.tril()
-            lower.diagonal().mul_(0.5)
+            lower.diagonal(dim1=-2, dim2=-1).mul_(0.5)
             inner = torch.linalg.solve_triangular(factor.mT, lower, upper=True)
             covariance_bar = -torch.linalg.solve_triangular(factor, inner, upper=False, left=False)
             symmetric = 0.5 * (covariance_bar + covariance_bar.mT)
@@ -61,7 +61,7 @@ class _Projection(torch.autograd.Function):
 
 
 def projection(
-    kernel: Kernel, x: Float[Tensor, "*p n D"], z: Float[Tensor, "M D"], factor: Float[Tensor, "M M"]
+    kernel: Kernel, x: Float[Tensor, "*p n D"], z: Float[Tensor, "*c M D"], factor: Float[Tensor, "*c M M"]
 ) -> Float[Tensor, "*p M n"]:
     """L^-1 r(Z, x), differentiable once in ``x`` and ``z``.
 

@@ -1,9 +1,10 @@
 """The last layer's inducing outputs given everything else, in closed form.
 
-Given the inner layers' inducing outputs and one draw of what they feed the last layer, the likelihood is linear and
-Gaussian in v_L, so v_L can be drawn exactly instead of by many SG-HMC steps. `mcem.py` uses it as a Gibbs step
-between SG-HMC steps: the chain forgets its start at once in the layer that the data determine most, and new data
-count in full as soon as they are observed.
+Given what the inner layers feed the last one, the likelihood is linear and Gaussian in v_L, so v_L can be drawn exactly
+instead of by many SG-HMC steps. `sampler.py` uses it as a Gibbs step between SG-HMC steps: the chain forgets its start
+at once in the layer that the data determine most, and new data count in full as soon as they are observed. It is a
+step of the joint posterior because the latents of the inner layers, which say what the last one is fed, are part of the
+chain's state; drawn from their prior instead, they would make the draw far too wide.
 """
 
 from typing import NamedTuple
@@ -12,56 +13,46 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.gp.deep_gp import Factorised, propagate_inner
-from gym_dgpmpc.gp.layer import project
+from gym_dgpmpc.gp.deep_gp import Factorised
 from gym_dgpmpc.gp.linalg import cholesky
+from gym_dgpmpc.inference.gradients import LayerTerms, Passed
 
 
 class LastLayerPosterior(NamedTuple):
-    """p(v_L | y, inner layers): independent Gaussians over the targets, N(mean_t, (R_t R_t^T)^-1)."""
+    """p(v_L | y, inner layers): independent Gaussians over chains and targets, N(mean, (R R^T)^-1)."""
 
-    mean: Float[Tensor, "T M"]
-    precision_factor: Float[Tensor, "T M M"]
+    mean: Float[Tensor, "C T M"]
+    precision_factor: Float[Tensor, "C T M M"]
 
-    def sample(self, num_samples: int, generator: torch.Generator) -> Float[Tensor, "n M T"]:
+    def sample(self, num_samples: int, generator: torch.Generator) -> Float[Tensor, "n C M T"]:
         """Independent draws."""
-        targets, inducing = self.mean.shape
-        noise = torch.randn(
-            targets, inducing, num_samples, generator=generator, dtype=self.mean.dtype, device=self.mean.device
-        )
+        shape = (*self.mean.shape, num_samples)
+        noise = torch.randn(shape, generator=generator, dtype=self.mean.dtype, device=self.mean.device)
         spread = torch.linalg.solve_triangular(self.precision_factor.mT, noise, upper=True)
-        return (self.mean.unsqueeze(-1) + spread).permute(2, 1, 0)
+        return (self.mean.unsqueeze(-1) + spread).permute(3, 0, 2, 1)
 
 
 def last_layer_posterior(
-    factorised: Factorised,
-    whitened: Float[Tensor, "V"],
-    x: Float[Tensor, "n D"],
-    y: Float[Tensor, "n T"],
-    generator: torch.Generator,
-    weight: float = 1.0,
+    factorised: Factorised, terms: LayerTerms, passed: Passed, y: Float[Tensor, "n T"], weight: float = 1.0
 ) -> LastLayerPosterior:
     """Bayesian linear regression on a_n = L_z^-1 k_zn whose datum n has the noise s_n = k_nn - |a_n|^2 + noise.
 
     precision = I + sum_n a_n a_n^T / s_n,  mean = precision^-1 sum_n a_n y_n / s_n, under the likelihood of
-    `deep_gp.log_likelihood` and one sample of the inner layers' function values at the data.
+    `deep_gp.log_likelihood`.
 
     Args:
-        whitened: flat vector of all layers; its last layer is not used.
+        terms, passed: of the last layer.
         weight: how often each datum counts: N / n where the rows are a subset of the data.
 
     Raises:
         FactorisationError: the precision is not finite, or so large that rounding hides the prior.
     """
-    model, factors = factorised
-    last = model.layers[-1]
-    hidden = propagate_inner(factorised, model.split(whitened), x, generator)
-    a = last.variance.sqrt() * project(last, factors[-1], hidden)
-    variance = (last.variance - a.square().sum(0)).clamp_min(0.0)
-    weights = weight / (variance + model.noise_variance.unsqueeze(-1))
-    weighted = a * weights.unsqueeze(1)
+    a = terms.variance.sqrt() * passed.seen.projected
+    noise = factorised.model.noise_variance
+    weights = weight / (passed.variance.unsqueeze(1) + noise.unsqueeze(-1))  # "C T n"
+    weighted = a.unsqueeze(1) * weights.unsqueeze(2)
     prior = torch.eye(a.shape[-2], dtype=a.dtype, device=a.device)
     # No eigenvalue lies below the prior's one, so no jitter is needed.
-    factor = cholesky(weighted @ a.mT + prior, torch.ones_like(weights[0, 0]), jitter=0.0)
+    factor = cholesky(weighted @ a.mT.unsqueeze(1) + prior, a.new_ones(()), jitter=0.0)
     mean = torch.cholesky_solve(weighted @ y.mT.unsqueeze(-1), factor).squeeze(-1)
     return LastLayerPosterior(mean, factor)

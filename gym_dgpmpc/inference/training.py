@@ -1,4 +1,4 @@
-"""How long to train, and what to do when training goes wrong: the loop around `mcem.MCEM.step`.
+"""How long to train, and what to do when training goes wrong: the loop around `sampler.Chains.step`.
 
 Every so many iterations it looks at the run. If the run has diverged, it goes back to the last look with half the step
 size. If the likelihood of held-out data no longer improves, it stops. `dynamics/deep_gp/` calls it once a fit.
@@ -16,16 +16,15 @@ from torch import Tensor
 
 from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.errors import FactorisationError, TrainingError
-from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all, log_likelihood, propagate
-from gym_dgpmpc.inference import mcem
-from gym_dgpmpc.inference.mcem import MCEM, InferenceSettings
-from gym_dgpmpc.inference.sghmc import SGHMCState
+from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, log_likelihood, propagate
+from gym_dgpmpc.inference import sampler
+from gym_dgpmpc.inference.sampler import Chains, ChainState, InferenceSettings
 
 MAX_ROLLBACKS = 5
 """The most rollbacks in one training; after the last of them the step sizes are 1/32 of the settings."""
 
 EXPLODED = 1e3
-"""A run whose negative log joint per observation is this far above the lowest seen has diverged."""
+"""A run whose negative log likelihood per observation is this far above the lowest seen has diverged."""
 
 MOST_WHITENED = 1e4
 """A chain with a whitened inducing output beyond this has diverged."""
@@ -36,17 +35,17 @@ HELD_OUT = 0.1, 256
 MIN_HELD_OUT = 10
 """With fewer rows their likelihood is too noisy to stop on, and nothing is held out."""
 
-HELD_OUT_SAMPLES = 8
-"""Positions of the window that the held-out likelihood is averaged over."""
+BURN_IN = 0.5
+"""The share of a first training in which hyperparameters that are to be sampled are optimised."""
 
 
 class Trained(NamedTuple):
     """The outcome of `train`."""
 
     model: DeepGP
-    chain: SGHMCState
-    negative_log_joint: float
-    """The last one, per observation, on a minibatch."""
+    state: ChainState
+    negative_log_likelihood: float
+    """The last one, per observation, on a minibatch; the mean over the chains."""
     num_iterations: int
     num_rollbacks: int
     settings: InferenceSettings
@@ -56,8 +55,8 @@ class Trained(NamedTuple):
 class Sampled(NamedTuple):
     """The outcome of `sample_pool`."""
 
-    pool: Float[Tensor, "n V"]
-    chain: SGHMCState
+    pool: Float[Tensor, "n C V"]
+    state: ChainState
     """At the last of the samples."""
     step_size: float
     """The one asked for, unless it had to be made smaller."""
@@ -65,20 +64,23 @@ class Sampled(NamedTuple):
 
 def train(
     model: DeepGP,
-    chain: SGHMCState,
+    whitened: Float[Tensor, "C V"],
     data: Data,
     num_iterations: int,
     generator: torch.Generator,
     settings: InferenceSettings,
+    *,
+    burn_in: float = BURN_IN,
     on_look: Callable[[int, float], None] | None = None,
 ) -> Trained:
     """Train for ``num_iterations`` iterations at most.
 
     Args:
         model: hyperparameters to start from; left as they are.
-        chain: where to start; its preconditioner is kept.
+        whitened: inducing outputs to start from.
         data: standardised; with early stopping a tenth of it serves to see when to stop.
-        on_look: is told the iterations done and the negative log joint, at the start and at every look.
+        burn_in: the share of the iterations in which hyperparameters that are to be sampled are optimised.
+        on_look: is told the iterations done and the negative log likelihood, at the start and at every look.
 
     Raises:
         TrainingError: training diverged again and again, with ever smaller steps.
@@ -86,7 +88,9 @@ def train(
     held_out = None
     if settings.patience is not None:
         data, held_out = _split_off_held_out(data, generator)
-    run = MCEM(model, chain, data, settings)
+    state = sampler.initial_state(model, whitened, data.num_rows, generator)
+    sampled = settings.hyperparameters == "sampled"
+    run = Chains(model, state, data, settings, round(burn_in * num_iterations) if sampled else num_iterations)
     good, best, rollbacks = run.snapshot(), run.evaluate(_copy_of(generator)), 0
     best_likelihood, looks_since = -math.inf, 0
     if on_look is not None:
@@ -103,23 +107,24 @@ def train(
                 )
             run.restore(good, scale=0.5)
             continue
-        good, best = run.snapshot(), min(best, float(run.value))
+        value = float(run.value.mean())
+        good, best = run.snapshot(), min(best, value)
         if on_look is not None:
-            on_look(run.iteration, float(run.value))
+            on_look(run.iteration, value)
         if held_out is not None:
-            positions = _draw_positions(run.window, generator)
-            likelihood = predictive_log_likelihood(factorise_all(run.model), positions, held_out, generator)
+            likelihood = predictive_log_likelihood(run.factorised, run.state.whitened.position, held_out, generator)
             improved = likelihood > best_likelihood
             best_likelihood = max(best_likelihood, likelihood)
             looks_since = 0 if improved else looks_since + 1
             if looks_since == settings.patience:
                 break
-    return Trained(run.model, run.chain, float(run.value), run.iteration, rollbacks, run.settings)
+    value = float(run.value.mean())
+    return Trained(run.model, run.state, value, run.iteration, rollbacks, run.settings)
 
 
 def sample_pool(
-    factorised: Factorised,
-    chain: SGHMCState,
+    model: DeepGP,
+    state: ChainState,
     data: Data,
     num_samples: int,
     spacing: int,
@@ -127,24 +132,24 @@ def sample_pool(
     settings: InferenceSettings,
     on_sample: Callable[[int], None] | None = None,
 ) -> Sampled:
-    """Posterior samples ``spacing`` steps apart.
+    """Posterior samples of each chain, ``spacing`` steps apart.
 
-    Begins anew with half the step size if the chain leaves what is plausible. After each sample ``on_sample`` is told
+    Begins anew with half the step size if a chain leaves what is plausible. After each sample ``on_sample`` is told
     how many there are.
 
     Raises:
         TrainingError: it did so again and again, with ever smaller steps.
     """
     for _ in range(MAX_ROLLBACKS + 1):
-        # Of the states in between only the positions are kept: a state is several times as large.
-        positions, last = [], chain
+        start = state._replace(latents=[latent.clone() for latent in state.latents])
+        chains, positions = Chains(model, start, data, settings, 0), []
         with suppress(FactorisationError):  # in an exact draw: the steps before it left values that are not finite
-            for last in mcem.sample(factorised, chain, data, num_samples, spacing, generator, settings):
-                positions.append(last.position)
+            for position in sampler.sample(chains, num_samples, spacing, generator):
+                positions.append(position)
                 if on_sample is not None:
                     on_sample(len(positions))
         if len(positions) == num_samples and is_plausible(pool := torch.stack(positions)):
-            return Sampled(pool, last, settings.step_size)
+            return Sampled(pool, chains.state, settings.step_size)
         settings = replace(settings, step_size=0.5 * settings.step_size)
     raise TrainingError(
         f"sampling the posterior diverged {MAX_ROLLBACKS + 1} times, the last time with the step size "
@@ -158,9 +163,9 @@ def is_plausible(positions: Float[Tensor, "*n V"]) -> bool:
 
 
 def predictive_log_likelihood(
-    factorised: Factorised, positions: Float[Tensor, "n V"], data: Data, generator: torch.Generator
+    factorised: Factorised, positions: Float[Tensor, "C V"], data: Data, generator: torch.Generator
 ) -> float:
-    """Mean log density of the data under the mixture over posterior samples."""
+    """Mean log density of the data under the mixture over the chains."""
     model, x = factorised.model, data.x.expand(len(positions), -1, -1)
     with torch.no_grad():
         mean, variance = propagate(factorised, model.split(positions), x, generator)
@@ -168,19 +173,19 @@ def predictive_log_likelihood(
     return float(density.mean())
 
 
-def _advance(run: MCEM, num_iterations: int, generator: torch.Generator, best: float) -> str | None:
+def _advance(run: Chains, num_iterations: int, generator: torch.Generator, best: float) -> str | None:
     """Take the steps; return what went wrong, or None. The host reads the run's values once, at the end."""
     try:
         for _ in range(num_iterations):
             run.step(generator)
     except FactorisationError as error:
         return str(error)
-    value = float(run.value)
-    if not math.isfinite(value) or not is_plausible(run.chain.position):
-        largest = float(run.chain.position.abs().max())
-        return f"the negative log joint is {value:g}, the largest whitened inducing output {largest:g}"
+    value, position = float(run.value.max()), run.state.whitened.position
+    if not math.isfinite(value) or not is_plausible(position):
+        largest = float(position.abs().max())
+        return f"the negative log likelihood is {value:g}, the largest whitened inducing output {largest:g}"
     if value > best + EXPLODED:
-        return f"the negative log joint rose from {best:g} to {value:g} per transition"
+        return f"the negative log likelihood rose from {best:g} to {value:g} per transition"
     return None
 
 
@@ -197,9 +202,3 @@ def _split_off_held_out(data: Data, generator: torch.Generator) -> tuple[Data, D
 def _copy_of(generator: torch.Generator) -> torch.Generator:
     """A generator that gives the same numbers and leaves the given one where it is."""
     return torch.Generator(generator.device).set_state(generator.get_state())
-
-
-def _draw_positions(window: Float[Tensor, "W V"], generator: torch.Generator) -> Float[Tensor, "n V"]:
-    """`HELD_OUT_SAMPLES` positions, drawn with replacement."""
-    rows = torch.randint(len(window), (HELD_OUT_SAMPLES,), generator=generator, device=window.device)
-    return window[rows]

@@ -1,0 +1,42 @@
+"""Priors of the hyperparameters of a deep Gaussian process, for standardised inputs and targets.
+
+`sampler.py` samples under them; `dynamics/deep_gp/start.py` starts at their centres. They are wide: the logarithm of a
+lengthscale, a variance or a noise variance is normal about the value that training starts from, with a standard
+deviation of `WIDTH`, so that a factor of e^3 = 20 to either side lies within two of them. Inducing inputs are standard
+normal, as the inputs are.
+"""
+
+import math
+
+from torch import Tensor
+
+from gym_dgpmpc.gp.deep_gp import DeepGP
+
+WIDTH = 1.5
+
+INNER_VARIANCE = 0.01
+NOISE_VARIANCE = 0.05
+
+
+def log_lengthscale_centre(input_size: int) -> float:
+    """log sqrt(D): two points at random are then about one and a half lengthscales apart, however large D."""
+    return 0.5 * math.log(input_size)
+
+
+def log_variance_centre(*, last: bool) -> float:
+    """Of a layer's kernel: the targets' own variance for the last; inner layers begin close to the identity."""
+    return 0.0 if last else math.log(INNER_VARIANCE)
+
+
+def log_prior_gradient(model: DeepGP) -> list[Tensor]:
+    """d log p(theta) / d theta, in the order of `DeepGP.parameters`."""
+    by_parameter = []
+    for index, layer in enumerate(model.layers):
+        last = index == len(model.layers) - 1
+        centre = log_lengthscale_centre(layer.inducing_inputs.shape[-1])
+        by_parameter += [
+            -layer.inducing_inputs,
+            (centre - layer.log_lengthscale) / WIDTH**2,
+            (log_variance_centre(last=last) - layer.log_variance) / WIDTH**2,
+        ]
+    return [*by_parameter, (math.log(NOISE_VARIANCE) - model.log_noise) / WIDTH**2]

@@ -1,0 +1,418 @@
+"""C chains side by side: SG-HMC over inducing outputs and hyperparameters, Metropolis moves of the latents.
+
+The target is the joint posterior of everything that is not observed,
+
+    p(v, e, theta | y)  ~  p(theta) N(v; 0, I) N(e; 0, I) prod_n p(y_n | v, e_n, theta),
+
+with v the whitened inducing outputs of all layers, e_n the latents of the inner layers at datum n (`gradients.py`), and
+theta the hyperparameters and inducing inputs. Integrating over e is the likelihood of Havasi et al. (2018) for a given
+v; they draw e afresh from its prior at every step, which follows the mean of log p(y | v, e) instead, a narrower law.
+Given v and theta the data are independent, so each e_n is moved by a Metropolis step of its own. Now and then the last
+layer is drawn exactly (`last_layer.py`), given all else. `training.py` decides how long; `dynamics/deep_gp/` keeps what
+comes out.
+
+With ``hyperparameters="optimised"`` theta follows the moving-window Monte Carlo EM of the paper instead: Adam steps
+under positions of the latest SG-HMC steps.
+"""
+
+import copy
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple, get_args
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gym_dgpmpc.checks import check_counts
+from gym_dgpmpc.data.standardised import Data, DataSource
+from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all
+from gym_dgpmpc.inference import sghmc
+from gym_dgpmpc.inference.adam import adam_memory
+from gym_dgpmpc.inference.gradients import (
+    Gradients,
+    LayerTerms,
+    Passed,
+    Seen,
+    forward,
+    gradients,
+    layer_terms,
+    likelihood,
+    see,
+    take,
+    take_passed,
+)
+from gym_dgpmpc.inference.last_layer import last_layer_posterior
+from gym_dgpmpc.inference.priors import log_prior_gradient
+from gym_dgpmpc.inference.sghmc import SGHMCState
+
+Hyperparameters = Literal["sampled", "optimised"]
+HYPERPARAMETERS: tuple[Hyperparameters, ...] = get_args(Hyperparameters)
+
+PROPOSALS = (0.0, 0.9, 0.99)
+"""Correlations of a proposed latent with the present one: far, near and nearer, for data that say little or much."""
+
+LAST_LEARNING_RATE = 1 / 6
+"""Adam's learning rate at the end of its iterations, as a share of that at their start; it falls geometrically."""
+
+
+@dataclass(frozen=True)
+class InferenceSettings:
+    """Settings of the sampler; `DeepGPDynamics` takes them as keyword arguments.
+
+    Attributes:
+        step_size: step size of SG-HMC for inducing outputs, epsilon; twice the value of Havasi et al., see
+            docs/deviations.md.
+        decay: friction of SG-HMC, m, in [0, 1].
+        hyperparameters: "sampled" with the inducing outputs, after a first half of the training that optimises them;
+            "optimised", as in the paper, gives one value for each chain and no prior.
+        hyperparameter_step_size: step size of SG-HMC for hyperparameters and inducing inputs.
+        learning_rate: learning rate of Adam, for hyperparameters and inducing inputs, at the start.
+        hyperparameters_every: iterations for each step of the hyperparameters.
+        window_size: latest SG-HMC positions, one of which is drawn for each Adam step.
+        batch_size: transitions in a minibatch; all of them where there are fewer.
+        gibbs_every: training iterations between two exact draws of the last layer, which each sample of the pool gets
+            too; 0 leaves everything to SG-HMC.
+        gibbs_rows: transitions that an exact draw is conditioned on; all of them where there are fewer.
+        patience: looks in a row without a better held-out log likelihood, after which training stops early; None trains
+            to the end, on all data.
+        look_every: iterations between two looks at how training goes.
+
+    Raises:
+        ValueError: a setting is out of its range.
+    """
+
+    step_size: float = 0.02
+    decay: float = 0.05
+    hyperparameters: Hyperparameters = "sampled"
+    hyperparameter_step_size: float = 0.06
+    learning_rate: float = 0.03
+    hyperparameters_every: int = 4
+    window_size: int = 1
+    batch_size: int = 256
+    gibbs_every: int = 20
+    gibbs_rows: int = 4096
+    patience: int | None = None
+    look_every: int = 100
+
+    def __post_init__(self) -> None:
+        names = ("hyperparameters_every", "window_size", "batch_size", "gibbs_rows", "look_every")
+        check_counts(**{name: getattr(self, name) for name in names})
+        if self.patience is not None:
+            check_counts(patience=self.patience)
+        for name in ("step_size", "hyperparameter_step_size", "learning_rate"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive and finite, received {getattr(self, name)}")
+        if not 0.0 <= self.decay <= 1.0:
+            raise ValueError(f"decay must lie in [0, 1], received {self.decay}")
+        if self.gibbs_every < 0:
+            raise ValueError(f"gibbs_every must be at least 0, received {self.gibbs_every}")
+        if self.hyperparameters not in HYPERPARAMETERS:
+            raise ValueError(
+                f"unknown hyperparameters {self.hyperparameters!r}: expected one of {', '.join(HYPERPARAMETERS)}"
+            )
+
+
+class ChainState(NamedTuple):
+    """Where C chains are."""
+
+    whitened: SGHMCState  # "C V"
+    parameters: SGHMCState  # "C H": all of `DeepGP.parameters`, one after the other
+    latents: list[Float[Tensor, "C N D"]]  # of each inner layer
+
+    @property
+    def num_chains(self) -> int:
+        return len(self.whitened.position)
+
+
+def flatten(parameters: list[Tensor]) -> Float[Tensor, "C H"]:
+    """The tensors of each chain in one row."""
+    return torch.cat([tensor.flatten(1) for tensor in parameters], dim=1)
+
+
+def with_flat(model: DeepGP, flat: Float[Tensor, "C H"]) -> DeepGP:
+    """The model with the hyperparameters of `flatten`, as views."""
+    shapes = [tensor.shape for tensor in model.parameters()]
+    parts = flat.split([shape[1:].numel() for shape in shapes], dim=1)
+    return model.with_parameters([part.view(shape) for part, shape in zip(parts, shapes, strict=True)])
+
+
+def initial_state(
+    model: DeepGP, whitened: Float[Tensor, "C V"], num_data: int, generator: torch.Generator
+) -> ChainState:
+    """Chains at rest, their latents drawn from the prior."""
+    state = ChainState(sghmc.init(whitened), sghmc.init(flatten(model.parameters())), [])
+    empty = [whitened.new_empty(len(whitened), 0, layer.inducing_inputs.shape[-1]) for layer in model.layers[:-1]]
+    return with_latents(state._replace(latents=empty), num_data, generator)
+
+
+def with_latents(state: ChainState, num_data: int, generator: torch.Generator) -> ChainState:
+    """The state with latents for grown data: those of new rows are drawn from the prior."""
+    grown = []
+    for latent in state.latents:
+        shape = (latent.shape[0], num_data - latent.shape[1], latent.shape[2])
+        new = torch.randn(shape, generator=generator, dtype=latent.dtype, device=latent.device)
+        grown.append(torch.cat([latent, new], dim=1))
+    return state._replace(latents=grown)
+
+
+class Chains:
+    """C chains on their way through the posterior, moved on by `step`.
+
+    Args:
+        model: the kernels, and hyperparameters to start from; left as they are.
+        state: where to start; preconditioners are kept.
+        data: what is conditioned on.
+        settings: of the sampler.
+        num_burn_in: iterations in which Adam moves the hyperparameters; of "sampled" ones, SG-HMC does after them.
+    """
+
+    def __init__(self, model: DeepGP, state: ChainState, data: DataSource, settings: InferenceSettings, num_burn_in: int):
+        self._kernels, self.data, self.settings, self._num_burn_in = model, data, settings, num_burn_in
+        self.state = state
+        self._flat = state.parameters.position.clone()
+        self._optimiser = torch.optim.Adam([self._flat], lr=settings.learning_rate)
+        self._optimiser.state[self._flat] = adam_memory(self._flat)
+        self._window = self._flat.new_empty(settings.window_size, *state.whitened.position.shape)
+        self.iteration = 0
+        self.value = self._flat.new_zeros(state.num_chains)
+        """The last negative log likelihood per observation, on a minibatch, of each chain."""
+        self._refactorise()
+
+    @property
+    def model(self) -> DeepGP:
+        """The present hyperparameters."""
+        return self.factorised.model
+
+    def _refactorise(self) -> None:
+        self.factorised = factorise_all(with_flat(self._kernels, self.state.parameters.position))
+        self._terms = layer_terms(self.factorised)
+        self._first: Seen | None = None
+
+    def evaluate(self, generator: torch.Generator) -> float:
+        """The negative log likelihood per observation where the chains are, on a minibatch; moves nothing."""
+        batch, index = self._batch(self.settings.batch_size, generator)
+        passed, _ = self._pass(self.state.whitened.position, batch, index, generator, move=False)
+        return -float(likelihood(self.factorised, passed, batch.y).mean())
+
+    def step(self, generator: torch.Generator, *, burn_in: bool = True) -> None:
+        """One SG-HMC step of the inducing outputs; now and then one of the hyperparameters, and one exact draw.
+
+        Args:
+            burn_in: adapt the preconditioners, and move the hyperparameters.
+
+        Raises:
+            FactorisationError: with the present hyperparameters a K_zz cannot be factorised.
+        """
+        settings, num_data, state = self.settings, self.data.num_rows, self.state
+        moves_parameters = burn_in and (self.iteration + 1) % settings.hyperparameters_every == 0
+        batch, index = self._batch(settings.batch_size, generator)
+        passed, latents = self._pass(state.whitened.position, batch, index, generator, move=self.iteration % 2 == 0)
+        self.value = -likelihood(self.factorised, passed, batch.y).mean(-1)
+        current = self._gradients(state.whitened.position, passed, latents, batch, of_parameters=moves_parameters)
+        whitened = sghmc.step(
+            state.whitened,
+            state.whitened.position / num_data - current.whitened,
+            num_data,
+            generator,
+            step_size=settings.step_size,
+            decay=settings.decay,
+            burn_in=burn_in,
+        )
+        self.state = self.state._replace(whitened=whitened)
+        if burn_in and settings.gibbs_every and self.iteration % settings.gibbs_every == 0:
+            self.draw_last_layer(generator)
+        self._window[self.iteration % settings.window_size] = self.state.whitened.position
+        self.iteration += 1
+        if moves_parameters:
+            if settings.window_size > 1:
+                current = self._at_window(batch, index, generator)
+            assert current.parameters is not None
+            self._move_parameters(flatten(current.parameters), num_data, generator)
+
+    def draw_last_layer(self, generator: torch.Generator) -> None:
+        """Draw the last layer's inducing outputs exactly, given all else, and bring them to rest there."""
+        whitened, inner = self.state.whitened, self.factorised.model.num_inner()
+        momentum = whitened.momentum.clone()
+        momentum[:, inner:] = 0.0
+        position = self.last_layer_draws(1, generator)[0]
+        self.state = self.state._replace(whitened=whitened._replace(position=position, momentum=momentum))
+
+    def last_layer_draws(self, num_samples: int, generator: torch.Generator) -> Float[Tensor, "n C V"]:
+        """Positions that share the chains' inner layers, each with its own exact draw of the last layer."""
+        batch, index = self._batch(self.settings.gibbs_rows, generator)
+        position, inner = self.state.whitened.position, self.factorised.model.num_inner()
+        passed, _ = self._pass(position, batch, index, generator, move=False)
+        weight = self.data.num_rows / batch.num_rows
+        posterior = last_layer_posterior(self.factorised, self._terms[-1], passed[-1], batch.y, weight)
+        drawn = posterior.sample(num_samples, generator).flatten(-2)
+        return torch.cat([position[:, :inner].expand(num_samples, -1, -1), drawn], dim=-1)
+
+    def _batch(self, size: int, generator: torch.Generator) -> tuple[Data, Int[Tensor, "n"] | None]:
+        """Rows of the data, drawn uniformly with replacement, and which they are; None stands for all of them."""
+        num_rows, device = self.data.num_rows, self._flat.device
+        if num_rows > size:
+            index = torch.randint(num_rows, (size,), generator=generator, device=device)
+            return self.data.rows(index), index
+        if isinstance(self.data, Data):
+            return self.data, None
+        return self.data.rows(torch.arange(num_rows, dtype=torch.int64, device=device)), None
+
+    def _pass(
+        self,
+        position: Float[Tensor, "C V"],
+        batch: Data,
+        index: Int[Tensor, "n"] | None,
+        generator: torch.Generator,
+        *,
+        move: bool,
+    ) -> tuple[list[Passed], list[Tensor]]:
+        """The rows through all layers with their latents, which are moved before if ``move`` says so."""
+        whitened = self.factorised.model.split(position)
+        latents = [latent if index is None else latent[:, index] for latent in self.state.latents]
+        x = batch.x.expand(len(position), -1, -1)
+        if index is not None:
+            first = None
+        else:
+            first = self._first = self._first or see(self._terms[0], x)
+        if not move or not latents:
+            return forward(self._terms, whitened, x, latents, first), latents
+        passed, latents = move_latents(self.factorised, self._terms, whitened, batch, latents, generator, first)
+        for held, moved in zip(self.state.latents, latents, strict=True):
+            # In place: only `snapshot` keeps a state beyond a step, and it copies them.
+            if index is None:
+                held.copy_(moved)
+            else:
+                held[:, index] = moved
+        return passed, latents
+
+    def _gradients(
+        self,
+        position: Float[Tensor, "C V"],
+        passed: list[Passed],
+        latents: list[Tensor],
+        batch: Data,
+        *,
+        of_parameters: bool,
+    ) -> Gradients:
+        whitened = self.factorised.model.split(position)
+        return gradients(
+            self.factorised, self._terms, whitened, passed, latents, batch.y, of_parameters=of_parameters
+        )
+
+    def _at_window(self, batch: Data, index: Int[Tensor, "n"] | None, generator: torch.Generator) -> Gradients:
+        """Gradients at a position drawn from the window."""
+        held = self._window[: min(self.iteration, len(self._window))]
+        pick = int(torch.randint(len(held), (1,), generator=generator, device=generator.device))
+        passed, latents = self._pass(held[pick], batch, index, generator, move=False)
+        return self._gradients(held[pick], passed, latents, batch, of_parameters=True)
+
+    def _move_parameters(self, gradient: Float[Tensor, "C H"], num_data: int, generator: torch.Generator) -> None:
+        """An Adam step, or, after the burn-in of "sampled" ones, an SG-HMC step; ``gradient`` is the likelihood's."""
+        settings, parameters = self.settings, self.state.parameters
+        sampled = settings.hyperparameters == "sampled"
+        if sampled:
+            prior = flatten(log_prior_gradient(self.factorised.model))
+            gradient = gradient + prior / num_data
+        gradient = -gradient
+        if sampled and self.iteration > self._num_burn_in:
+            parameters = sghmc.step(
+                parameters,
+                gradient,
+                num_data,
+                generator,
+                step_size=settings.hyperparameter_step_size,
+                decay=settings.decay,
+                burn_in=True,
+            )
+        else:
+            parameters = sghmc.adapt(parameters, gradient)
+            done = self.iteration / max(self._num_burn_in, 1)
+            self._optimiser.param_groups[0]["lr"] = settings.learning_rate * LAST_LEARNING_RATE ** min(done, 1.0)
+            self._flat.copy_(parameters.position)
+            self._flat.grad = gradient
+            self._optimiser.step()
+            parameters = parameters._replace(position=self._flat.clone())
+        self.state = self.state._replace(parameters=parameters)
+        self._refactorise()
+
+    def snapshot(self) -> "Snapshot":
+        """A copy of everything that `step` moves."""
+        latents = [latent.clone() for latent in self.state.latents]
+        optimiser = copy.deepcopy(self._optimiser.state_dict())
+        return Snapshot(
+            self.state._replace(latents=latents), optimiser, self._window.clone(), self.iteration, self.value
+        )
+
+    def restore(self, snapshot: "Snapshot", scale: float = 1.0) -> None:
+        """Go back to a snapshot, with all step sizes multiplied by ``scale``, and the chains brought to rest.
+
+        The snapshot may be used again.
+        """
+        state = snapshot.state
+        self.state = ChainState(
+            _at_rest(state.whitened), _at_rest(state.parameters), [latent.clone() for latent in state.latents]
+        )
+        self._optimiser.load_state_dict(copy.deepcopy(snapshot.optimiser))
+        self._window.copy_(snapshot.window)
+        self.iteration, self.value = snapshot.iteration, snapshot.value
+        names = ("step_size", "hyperparameter_step_size", "learning_rate")
+        self.settings = replace(self.settings, **{name: scale * getattr(self.settings, name) for name in names})
+        self._refactorise()
+
+
+class Snapshot(NamedTuple):
+    """See `Chains.snapshot`."""
+
+    state: ChainState
+    optimiser: dict[str, Any]
+    window: Tensor
+    iteration: int
+    value: Tensor
+
+
+def move_latents(
+    factorised: Factorised,
+    terms: list[LayerTerms],
+    whitened: list[Float[Tensor, "C M O"]],
+    batch: Data,
+    latents: list[Float[Tensor, "C n D"]],
+    generator: torch.Generator,
+    first: Seen | None = None,
+) -> tuple[list[Passed], list[Tensor]]:
+    """One Metropolis step of every datum's latents, given all else; the points as they then pass through the layers.
+
+    Proposed is r e + sqrt(1 - r^2) N(0, I), which leaves the prior as it is, so that the likelihoods alone decide
+    (preconditioned Crank-Nicolson; Cotter et al. 2013). r is one of `PROPOSALS`.
+    """
+    correlation = PROPOSALS[int(torch.randint(len(PROPOSALS), (1,), generator=generator, device=generator.device))]
+    both = []
+    for latent in latents:
+        fresh = torch.randn(latent.shape, generator=generator, dtype=latent.dtype, device=latent.device)
+        both.append(torch.cat([latent, correlation * latent + math.sqrt(1.0 - correlation**2) * fresh], dim=1))
+    seen = first or see(terms[0], batch.x.expand(len(whitened[0]), -1, -1))
+    twice = Seen(*(torch.cat([part, part], dim=2 if part is seen.projected else 1) for part in seen))
+    x = batch.x.expand(len(whitened[0]), -1, -1)
+    passed = forward(terms, whitened, torch.cat([x, x], dim=1), both, twice)
+    log_density = likelihood(factorised, passed, torch.cat([batch.y, batch.y]))
+    present, proposed = log_density.chunk(2, dim=1)
+    uniform = torch.rand(present.shape, generator=generator, dtype=present.dtype, device=present.device)
+    accepted = uniform.log() < proposed - present
+    rows = torch.arange(batch.num_rows, dtype=torch.int64, device=present.device)
+    rows = rows + batch.num_rows * accepted
+    return [take_passed(layer, rows) for layer in passed], [take(latent, rows) for latent in both]
+
+
+def sample(chains: Chains, num_samples: int, spacing: int, generator: torch.Generator) -> Iterator[Float[Tensor, "C V"]]:
+    """Go on with frozen hyperparameters and preconditioners; yield the positions every ``spacing`` steps."""
+    for _ in range(num_samples):
+        for _ in range(spacing):
+            chains.step(generator, burn_in=False)
+        if chains.settings.gibbs_every:
+            chains.draw_last_layer(generator)
+        yield chains.state.whitened.position
+
+
+def _at_rest(state: SGHMCState) -> SGHMCState:
+    return state._replace(momentum=torch.zeros_like(state.momentum))
