@@ -1,5 +1,6 @@
 """The base of models that are fitted to encoded transitions: the encoding, and whether there was a fit yet."""
 
+from collections.abc import Callable
 from typing import ClassVar, Generic, TypeVar
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.data.standardised import Data
+from gym_dgpmpc.dynamics.noise import NoiseSplit, split_noise
 from gym_dgpmpc.forks import compute_on_one_thread_in_children
 from gym_dgpmpc.types import ObservationSpec, ProgressFn, Transitions
 
@@ -26,6 +28,8 @@ class Learner(Generic[Fitted]):
         observation_spec: how to read the observation.
         dtype: precision of rollouts.
         device: where tensors live.
+        add_noise: draw the fitted noise too.
+        split_noise: of that, draw apart what only blurs the observation; see `noise.py`.
 
     Attributes:
         on_progress: see `ReportsProgress`.
@@ -41,9 +45,13 @@ class Learner(Generic[Fitted]):
         observation_spec: ObservationSpec | None,
         dtype: torch.dtype,
         device: torch.device | str,
+        *,
+        add_noise: bool = False,
+        split_noise: bool = False,
     ):
         self.encoder = Encoder(observation_size, action_size, observation_spec)
         self.dtype, self.device = dtype, torch.device(device)
+        self.add_noise, self.split_noise = add_noise, split_noise
         self._fitted: Fitted | None = None
         self.on_progress: ProgressFn | None = None
         compute_on_one_thread_in_children()
@@ -71,6 +79,43 @@ class Learner(Generic[Fitted]):
         inputs = Normaliser.fit(x, precision=precision)
         targets = Normaliser.fit(y, magnitudes.to(y), precision)
         return (inputs, targets), Data(inputs(x), targets(y))
+
+    def _split_noise(
+        self,
+        data: Transitions,
+        normalisers: tuple[Normaliser, Normaliser],
+        predict: Callable[[Float[Tensor, "n D"]], Float[Tensor, "n T"]],
+        variance: Float[Tensor, "T"],
+    ) -> NoiseSplit | None:
+        """What the data say of the fitted noise; None where draws do not ask for it.
+
+        Args:
+            data: what was fitted to.
+            normalisers: of inputs and targets.
+            predict: the posterior mean, standardised, float64 in and out.
+            variance: of the noise, standardised.
+        """
+        if not (self.add_noise and self.split_noise):
+            return None
+        inputs, targets = normalisers
+        return split_noise(
+            data,
+            self.encoder,
+            lambda raw: targets.inverse(predict(inputs(raw))),
+            variance.double() * targets.std.square(),
+        )
+
+    def _drawn_noise(self, found: NoiseSplit | None) -> NoiseSplit:
+        """What of the fitted noise to draw, by the settings; ``found`` is None where nothing was told apart."""
+        if self.add_noise and self.split_noise and found is not None:
+            return found
+        return NoiseSplit.all_process(self.encoder.target_size, self.device, share=float(self.add_noise))
+
+    def _noise_metrics(
+        self, found: NoiseSplit | None, targets: Normaliser, variance: Float[Tensor, "T"]
+    ) -> dict[str, float]:
+        """Both parts of the noise, in units of the targets' standardisation; nothing where they are not told apart."""
+        return {} if found is None else found.metrics(variance.double() * targets.std.square(), targets.std)
 
     def _require_fit(self, verb: str) -> Fitted:
         if self._fitted is None:

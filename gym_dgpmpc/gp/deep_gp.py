@@ -126,6 +126,18 @@ def propagate_inner(
     return x
 
 
+def propagate_means(
+    factorised: Factorised, whitened: list[Tensor], x: Float[Tensor, "*p n D"]
+) -> Float[Tensor, "*p n T"]:
+    """The last layer's mean where every inner layer has its own: what is drawn, but for the inner layers' variance."""
+    model, factors = factorised
+    last = len(factors) - 1
+    for index, (layer, factor, v) in enumerate(zip(model.layers, factors, whitened, strict=True)):
+        mean, _ = conditional(layer, factor, v, x)
+        x = mean if index == last else x + mean
+    return x
+
+
 def log_likelihood(
     model: DeepGP,
     mean: Float[Tensor, "*p n T"],

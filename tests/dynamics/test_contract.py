@@ -13,6 +13,7 @@ import torch
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.ensemble.draws import PROPAGATIONS
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
+from gym_dgpmpc.dynamics.noise import NoiseSplit
 from gym_dgpmpc.dynamics.sparse_gp.model import GP_DRAWS, SparseGPDynamics
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.planning.rollout import rollout
@@ -267,11 +268,12 @@ def test_a_gaussian_process_finds_the_linear_system(name):
             assert (error <= bound).all(), (t, error, bound)
 
 
-def linear_ensemble(draw, num_members=5):
+def linear_ensemble(draw, num_members=5, **options):
     """An ensemble that is exactly the linear system with its noise: swish(x) - swish(-x) = x."""
     model = EnsembleDynamics(
-        3, 1, slider.SPEC, num_members=num_members, num_hidden_layers=1, hidden_size=8, weight_decay=(0, 0), draw=draw
-    )
+        3, 1, slider.SPEC, num_members=num_members, num_hidden_layers=1, hidden_size=8, weight_decay=(0, 0), draw=draw,
+        **options,
+    )  # fmt: skip
     model.fit(slider.transitions(4, NOISE), seeded())  # for a state of the right shapes
     state = dict(model.state_dict())
     effect = torch.tensor(np.hstack([slider.A - np.eye(3), slider.B])[:2].T, dtype=torch.float32)  # of (s, a): "4 2"
@@ -346,3 +348,86 @@ def test_a_training_that_says_how_far_it_is_is_the_same(learner):
     assert done[-1] <= totals[-1]
     assert set(totals) == {totals[0]}
     assert np.isfinite(losses).all()
+
+
+def noise_state(variance, size=2):
+    """Of the fitted noise 0.6 moves the process, and observations have a half and a third of it beside."""
+    return NoiseSplit(
+        torch.full((size,), 0.6, dtype=torch.float64),
+        variance * torch.tensor([1 / 2, 1 / 3], dtype=torch.float64),
+        torch.tensor([0.05, 0.0], dtype=torch.float64),
+        torch.tensor([0.4, 0.0], dtype=torch.float64),
+    )
+
+
+def variances_with_noise(split, process_variance, forgets_correlations):
+    """Of what is observed, [H, 2], by the covariance's recursion: the start's error, then A D C D A^T + W, and R."""
+    A, R = slider.A[:2, :2], split.observation_variance.numpy()
+    stretch, covariance, found = 1 / (1 - split.dilution.numpy()), np.zeros((2, 2)), []
+    for step in range(HORIZON):
+        fed = np.diag(R * stretch) if step == 0 else covariance * np.outer(stretch, stretch)
+        covariance = A @ fed @ A.T + np.diag(process_variance)
+        if forgets_correlations:
+            covariance = np.diag(np.diag(covariance))
+        found.append(np.diag(covariance) + R)
+    return np.stack(found)
+
+
+NOISY = [name for name, case in CASES.items() if case.family not in ("truth", "ensemble")]
+
+
+@pytest.mark.parametrize("name", NOISY)
+def test_draws_of_a_gaussian_process_with_noise_spread_by_the_recursion(name):
+    """Beside their spread without noise, to which it adds, since the system is linear: within four standard errors of
+    both variances, each sqrt(2 / P) of it, and a tenth for what is not linear in the fit."""
+    num_particles = 500
+    silent, noisy = fitted(name), CASES[name].make(add_noise=True)
+    model = getattr(silent._fitted, "factorised", silent._fitted)
+    variance = model.model.noise_variance * silent.state_dict()["targets.std"] ** 2
+    split = noise_state(variance)
+    noisy.load_state_dict(silent.state_dict() | split.state())
+    spread, alone = (states_of(each, num_particles=num_particles)[1:, :, 0].var(1) for each in (noisy, silent))
+    known = variances_with_noise(split, 0.6 * variance.numpy(), "MM" in name and "AMM" not in name)
+    error = 4 * (2 / num_particles) ** 0.5 * (spread + alone)[:, :2].numpy() + 0.1 * known
+    assert (np.abs((spread - alone)[:, :2].numpy() - known) <= error).all()
+    assert (spread[:, 2] == 0).all(), "a constant has no noise"
+
+
+@pytest.mark.parametrize("draw", ["TS1", "TSinf", "DS", "MM"])
+def test_draws_of_an_ensemble_with_noise_spread_by_the_recursion(draw):
+    """Within five standard errors, of a variance sqrt(2 / P) of it; those of `MM` add up over the steps."""
+    num_particles, variance = 4000, torch.full((2,), NOISE**2, dtype=torch.float64)
+    split, means_alone = noise_state(variance), linear_ensemble(draw, add_noise=False)
+    noisy = linear_ensemble(draw, split_noise=True)
+    noisy.load_state_dict(noisy.state_dict() | split.state())
+    spread = states_of(noisy, num_particles=num_particles)[1:, :, 0].var(1)[:, :2].double().numpy()
+    known = variances_with_noise(split, 0.6 * variance.numpy(), draw == "MM")
+    steps = np.arange(1, HORIZON + 1)[:, None] if draw == "MM" else 1
+    assert (np.abs(spread - known) <= 5 * known * np.sqrt(2 * steps * 2 / num_particles)).all()
+    assert states_of(means_alone)[1:].var(1).max() < 1e-10
+
+
+def test_what_was_told_apart_is_kept_and_older_states_have_none_of_it(learner):
+    model = CASES[learner].make(add_noise=True, split_noise=True)
+    model.load_state_dict(trained_state(CASES[learner].family))  # older: all is the process's
+    assert not any(key.startswith("noise.") for key in model.state_dict())
+    older = states_of(model)
+    state = noise_state(torch.tensor([1e-4, 1e-4], dtype=torch.float64)).state()
+    model.load_state_dict(model.state_dict() | state)
+    assert torch.equal(states_of(model), older) == (not CASES[learner].is_random)
+    model.resample(slider.transitions(NUM_DATA + 20, NOISE), seeded())
+    same_states(state, {key: value for key, value in model.state_dict().items() if key.startswith("noise.")})
+    with pytest.raises(ValueError, match=r"noise\.centre"):
+        model.load_state_dict({key: value for key, value in model.state_dict().items() if key != "noise.centre"})
+
+
+def test_a_training_says_how_much_noise_of_each_kind_it_found(learner):
+    """Where it is asked to tell them apart; these transitions do not follow one another, so all is the process's."""
+    data = slider.transitions(40, NOISE)
+    silent, asked = CASES[learner].make(add_noise=False), CASES[learner].make(add_noise=True, split_noise=True)
+    for model in (silent, asked):
+        model.load_state_dict(trained_state(CASES[learner].family))
+    metrics, more = silent.fit(data, seeded()), asked.fit(data, seeded())
+    assert more.items() >= metrics.items(), "the training is the same"
+    assert set(more) - set(metrics) == {"process_noise_std", "observation_noise_std"}
+    assert more["observation_noise_std"] == 0.0 and more["process_noise_std"] > 0.0

@@ -21,6 +21,7 @@ from torch.nn.functional import pad
 
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp import compiler
+from gym_dgpmpc.dynamics.noise import PathNoise
 from gym_dgpmpc.gp.kernels import Kernel
 
 _Floats = ctypes.POINTER(ctypes.c_float)
@@ -80,6 +81,9 @@ class _Task(ctypes.Structure):
         ("num_vectors", ctypes.c_int64),
         ("vectors", _Integers),
         ("layers", ctypes.POINTER(_Layer)),
+        ("noise", _Floats),
+        ("stretch", _Floats),
+        ("centre", _Floats),
         ("start", _Floats),
         ("actions", _Floats),
         ("states", _Floats),
@@ -105,18 +109,19 @@ class CompiledRollout:
     Args:
         layers: the functions, float32 on the CPU.
         coordinates: raw states to standardised coordinates and back, float32.
+        noise: what the worlds have of it, if any.
 
     Raises:
         RuntimeError: there is no compiled code, or it lacks a layer's kernel; see `is_available`.
     """
 
-    def __init__(self, layers: Sequence[PathwiseLayer], coordinates: Coordinates):
+    def __init__(self, layers: Sequence[PathwiseLayer], coordinates: Coordinates, noise: PathNoise | None = None):
         library = _library()
         if library is None:
             raise RuntimeError("no compiled code on this machine: check is_available() first")
         self._library, units = library, int(library.units())
         encoder, first = coordinates.encoder, layers[0]
-        self._coordinates = coordinates
+        self._coordinates, self._noise = coordinates, noise
         self._kept_alive: list[Tensor] = []  # the memory that the structures point into
         self._layers = (_Layer * len(layers))(*(self._packed(layer, units) for layer in layers))
         vectors = encoder.spec.body_frame
@@ -127,6 +132,7 @@ class CompiledRollout:
         inputs += [(ACTION, i) for i in range(encoder.action_size)]
         target = torch.full((encoder.observation_size,), -1, dtype=torch.int64, device="cpu")
         target[encoder.predicted] = torch.arange(encoder.target_size, dtype=torch.int64, device="cpu")
+        blur = None if noise is None else noise.observation
         spread = torch.zeros(encoder.observation_size, dtype=torch.float32, device="cpu")
         spread[encoder.predicted] = coordinates.spread
         self._task = _Task(
@@ -149,6 +155,9 @@ class CompiledRollout:
             num_vectors=len(vectors),
             vectors=self._integers(vectors),
             layers=self._layers,
+            noise=None if noise is None else self._floats(noise.process),
+            stretch=None if blur is None else self._floats(blur.stretch),
+            centre=None if blur is None else self._floats(blur.centre),
         )
 
     def __call__(
@@ -167,13 +176,19 @@ class CompiledRollout:
         self._check_sizes(observation, actions)
         num_candidates, horizon, _ = actions.shape
         task = _Task.from_buffer_copy(self._task)
-        origin = None
+        origin, begins = None, observation.expand(task.num_particles, -1)
+        errors, blur = (None, None) if self._noise is None else (self._noise.errors, self._noise.observation)
+        if errors is not None:
+            begins = begins - errors[0]
         if observation.dtype == torch.float64:
             origin = self._origin(observation)
             moved = [tensor.float().contiguous() for tensor in self._about(origin)]
             task.input_mean, task.shift = (_pointer(tensor) for tensor in moved)
-            observation = observation - origin
-        start = observation.to(torch.float32).contiguous()
+            begins = begins - origin
+            if blur is not None:
+                moved.append((blur.centre - origin).float().contiguous())
+                task.centre = _pointer(moved[-1])
+        start = begins.to(torch.float32).contiguous()
         actions = actions.to(torch.float32).contiguous()
         states = actions.new_empty(horizon + 1, task.num_particles, num_candidates, task.observation_size)
         task.num_candidates, task.horizon = num_candidates, horizon
@@ -190,7 +205,11 @@ class CompiledRollout:
         failed = run(*ranges[0]) if len(ranges) == 1 else sum(_threads(threads).map(lambda r: run(*r), ranges))
         if failed:
             raise MemoryError("could not allocate the scratch space of a rollout, a few kilobytes for each thread")
-        return states if origin is None else states + origin
+        states = states if origin is None else states + origin
+        if errors is not None:
+            states[1:] += errors[1 : horizon + 1].unsqueeze(2)
+            states[0] = observation
+        return states
 
     def _origin(self, observation: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
         """A place near the observation that states can be told from: of an angle whole turns, which change nothing."""
@@ -209,16 +228,17 @@ class CompiledRollout:
 
     def _check_sizes(self, observation: Tensor, actions: Tensor) -> None:
         """Refuse wrong sizes: the compiled code trusts them, and would read beyond the arrays."""
-        task = self._task
+        task, noise = self._task, self._noise
+        longest = task.num_functions if noise is None else len(noise.process)
         if observation.shape != (task.observation_size,):
             raise ValueError(
                 f"the observation must have the shape ({task.observation_size},), got {tuple(observation.shape)}"
             )
         if actions.ndim != 3 or actions.shape[2] != task.action_size:
             raise ValueError(f"the actions must have the shape [K, H, {task.action_size}], got {tuple(actions.shape)}")
-        if task.num_functions > 1 and actions.shape[1] > task.num_functions:
+        if (longest > 1 or noise is not None) and actions.shape[1] > longest:
             raise ValueError(
-                f"the actions must not exceed the {task.num_functions} steps that these worlds were drawn for, got "
+                f"the actions must not exceed the {longest} steps that these worlds were drawn for, got "
                 f"{actions.shape[1]}"
             )
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp.compiled_rollout import CompiledRollout, PathwiseLayer
+from gym_dgpmpc.dynamics.noise import ObservationNoise, PathNoise
 from gym_dgpmpc.gp.deep_gp import Factorised
 from gym_dgpmpc.gp.features import draw_features
 from gym_dgpmpc.gp.layer import Layer, conditional, joint_conditional
@@ -28,6 +29,10 @@ Draw = Literal["pathwise", "joint", "marginal"]
 Refresh = Literal["step", "plan"]
 DRAWS: tuple[Draw, ...] = get_args(Draw)
 REFRESHES: tuple[Refresh, ...] = get_args(Refresh)
+
+
+Noise = tuple[Float[Tensor, "T"], ObservationNoise | None]
+"""The standard deviation of the process noise, in standardised targets, and the observation noise, if any."""
 
 
 class Posterior(NamedTuple):
@@ -40,12 +45,22 @@ class Posterior(NamedTuple):
 class ConditionalSampler:
     """The draws `joint` and `marginal`: values from p(f | u) at each step, with fresh noise.
 
-    Factorises in the posterior's precision (float64) whatever the precision of the states. A point that is not finite
+    Factorises in the posterior's precision (float64) whatever the precision of the states. ``noise_std`` is that of the
+    process noise, in standardised targets, if it is to be drawn. A point that is not finite
     is NaN after the step, and no other point feels it.
     """
 
-    def __init__(self, posterior: Posterior, coordinates: Coordinates, generator: torch.Generator, *, joint: bool):
+    def __init__(
+        self,
+        posterior: Posterior,
+        coordinates: Coordinates,
+        generator: torch.Generator,
+        *,
+        joint: bool,
+        noise_std: Float[Tensor, "T"] | None = None,
+    ):
         self._posterior, self._coordinates, self._generator, self._joint = posterior, coordinates, generator, joint
+        self._noise_std = noise_std
 
     def __call__(
         self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
@@ -59,6 +74,8 @@ class ConditionalSampler:
         for index, (layer, factor, v) in enumerate(zip(model.layers, factors, whitened, strict=True)):
             value = self._sample_layer(layer, factor, v, x)
             x = value if index == last else x + value
+        if self._noise_std is not None:
+            x = x + self._noise_std * torch.randn(x.shape, generator=self._generator, dtype=x.dtype, device=x.device)
         return self._coordinates.decode(observation, x).masked_fill(lost, math.nan)
 
     def _sample_layer(self, layer: Layer, factor: Tensor, v: Tensor, x: Tensor) -> Tensor:
@@ -131,6 +148,10 @@ class PathwiseSampler:
         refresh: "step" or "plan".
         dtype: precision of the rollout; the functions themselves are solved for in the posterior's precision.
         generator: of the posterior's device.
+        noise: what to draw of it, if any.
+
+    Attributes:
+        noise: what was drawn of it.
     """
 
     def __init__(
@@ -142,6 +163,7 @@ class PathwiseSampler:
         refresh: Refresh,
         dtype: torch.dtype,
         generator: torch.Generator,
+        noise: Noise | None = None,
     ):
         (model, factors), whitened = posterior
         num_functions = horizon if refresh == "step" else 1
@@ -150,11 +172,16 @@ class PathwiseSampler:
             _draw_layer(layer, factor, v, num_functions, num_features, dtype, generator)
             for layer, factor, v in zip(model.layers, factors, whitened, strict=True)
         ]
+        self.noise: PathNoise | None = None
+        if noise is not None:
+            self.noise = PathNoise.draw(*noise, horizon, len(whitened[0]), dtype, generator)
         self._buffers: _Buffers | None = None
 
     def __call__(
         self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
     ) -> Float[Tensor, "P K S"]:
+        if self.noise is not None:
+            observation = self.noise.fed(observation, step)
         x = self.coordinates.encode(observation, action)
         if self._buffers is None or self._buffers.augmented.shape[:2] != x.shape[:2]:
             self._buffers = _Buffers.allocate(x, self.layers[0])
@@ -162,7 +189,10 @@ class PathwiseSampler:
         for layer, weights in zip(self.layers[:-1], self._in_weights, strict=False):
             x = x + self._evaluate(layer, weights, x, function, self._buffers)
         target = self._evaluate(self.layers[-1], self._in_weights[-1], x, function, self._buffers)
-        return self.coordinates.decode(observation, target)
+        if self.noise is not None:
+            target = target + self.noise.process[step].unsqueeze(1)
+        after = self.coordinates.decode(observation, target)
+        return after if self.noise is None else self.noise.observed(after, step)
 
     @cached_property
     def _in_weights(self) -> list[tuple[Tensor, Tensor]]:
@@ -212,9 +242,10 @@ class CompiledPathwiseSampler(PathwiseSampler):
         num_features: int,
         refresh: Refresh,
         generator: torch.Generator,
+        noise: Noise | None = None,
     ):
-        super().__init__(posterior, coordinates, horizon, num_features, refresh, torch.float32, generator)
-        self._rollout = CompiledRollout(self.layers, coordinates)
+        super().__init__(posterior, coordinates, horizon, num_features, refresh, torch.float32, generator, noise)
+        self._rollout = CompiledRollout(self.layers, coordinates, self.noise)
 
     def trajectories(
         self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]

@@ -32,9 +32,10 @@ from gym_dgpmpc.dynamics.deep_gp.draws import (
 )
 from gym_dgpmpc.dynamics.deep_gp.start import initial_model, relocate, restandardise
 from gym_dgpmpc.dynamics.learner import Learner
+from gym_dgpmpc.dynamics.noise import NoiseSplit, observed, take_noise_split
 from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.errors import FactorisationError
-from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all
+from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all, propagate_means
 from gym_dgpmpc.gp.kernels import Kernel, find_kernel
 from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.inference import mcem, sghmc, training
@@ -52,6 +53,7 @@ class _Fitted(NamedTuple):
     pool: Tensor  # "num_samples V", a ring
     oldest: int  # the row of the pool that the next sample replaces
     step_size: float  # of SG-HMC: the setting, unless training had to take smaller steps
+    noise: NoiseSplit | None = None  # None: not told apart
 
 
 class _Standardised(NamedTuple):
@@ -96,6 +98,9 @@ class DeepGPDynamics(Learner[_Fitted]):
         resample_samples: samples of the pool that are replaced after each control step, at least 1, if the last layer
             is drawn exactly.
         relocate: move the inducing inputs to the cluster centres of the grown data before each later fit.
+        add_noise: draw the fitted noise too, so that plans reckon with it: for plants or sensors that are noisy.
+        split_noise: where ``add_noise`` is on, tell the sensors' noise, which only blurs what is observed, from the
+            process's, which adds up over a plan, as far as the data show it; otherwise all of it adds up.
         compile: roll "pathwise" draws out in compiled code, several times faster; a C++ compiler builds it once in a
             few seconds. PyTorch does it where there is no compiler, on a GPU, and for kernels of your own.
         dtype: precision of rollouts; training and every factorisation are in float64.
@@ -136,6 +141,8 @@ class DeepGPDynamics(Learner[_Fitted]):
         resample_steps: int = 10,
         resample_samples: int = 5,
         relocate: bool = True,
+        add_noise: bool = False,
+        split_noise: bool = True,
         compile: bool = True,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
@@ -157,7 +164,8 @@ class DeepGPDynamics(Learner[_Fitted]):
             raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(DRAWS)}")
         if refresh not in REFRESHES:
             raise ValueError(f"unknown refresh {refresh!r}: expected one of {', '.join(REFRESHES)}")
-        super().__init__(observation_size, action_size, observation_spec, dtype, device)
+        noise = {"add_noise": add_noise, "split_noise": split_noise}
+        super().__init__(observation_size, action_size, observation_spec, dtype, device, **noise)
         self.kernel: Kernel = find_kernel(kernel)
         self.num_layers, self.num_inducing, self.num_features = num_layers, num_inducing, num_features
         self.draw_kind, self.refresh = draw, refresh
@@ -207,9 +215,12 @@ class DeepGPDynamics(Learner[_Fitted]):
             trained.settings,
             lambda count: report(iterations + count * self.sample_spacing, total, trained.negative_log_joint),
         )
-        self._fitted = _Fitted(factorised, normalisers, sampled.chain, sampled.pool, 0, sampled.step_size)
+        variance = factorised.model.noise_variance
+        noise = self._split_noise(data, normalisers, _posterior_mean(factorised, sampled.pool), variance)
+        self._fitted = _Fitted(factorised, normalisers, sampled.chain, sampled.pool, 0, sampled.step_size, noise)
         counts = {"iterations": float(trained.num_iterations), "rollbacks": float(trained.num_rollbacks)}
-        return {"negative_log_joint": trained.negative_log_joint} | counts | self._diagnostics(self._fitted)
+        metrics = {"negative_log_joint": trained.negative_log_joint} | counts | self._diagnostics(self._fitted)
+        return metrics | self._noise_metrics(noise, normalisers[1], variance)
 
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """Follow the grown data: the newest samples take the places of the pool's oldest.
@@ -267,12 +278,18 @@ class DeepGPDynamics(Learner[_Fitted]):
         whitened = fitted.factorised.model.split(fitted.pool[picked])
         posterior = Posterior(fitted.factorised, whitened)
         coordinates = Coordinates(self.encoder, *fitted.normalisers, self.dtype)
+        drawn = self._drawn_noise(fitted.noise)
+        process_std = (fitted.factorised.model.noise_variance * drawn.process_share).sqrt() if self.add_noise else None
+        blur = drawn.observation(self.encoder)
         if self.draw_kind == "pathwise":
             settings = posterior, coordinates, horizon, self.num_features, self.refresh
+            noise = None if process_std is None else (process_std, blur)
             if self.compile and compiled_rollout.is_available(self.kernel):
-                return CompiledPathwiseSampler(*settings, generator)
-            return PathwiseSampler(*settings, self.dtype, generator)
-        return ConditionalSampler(posterior, coordinates, generator, joint=self.draw_kind == "joint")
+                return CompiledPathwiseSampler(*settings, generator, noise)
+            return PathwiseSampler(*settings, self.dtype, generator, noise)
+        joint = self.draw_kind == "joint"
+        sampler = ConditionalSampler(posterior, coordinates, generator, joint=joint, noise_std=process_std)
+        return observed(sampler, blur, generator)
 
     def state_dict(self) -> StateDict:
         """Hyperparameters, normalisers, the chain and the whole pool of samples; empty before the first fit."""
@@ -285,7 +302,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             state["step_size"] = fitted.step_size
         for index, layer in enumerate(model.layers):
             state |= {f"layers.{index}.{name}": value for name, value in layer.parameters().items()}
-        state |= normalisers_state(*fitted.normalisers)
+        state |= normalisers_state(*fitted.normalisers) | ({} if fitted.noise is None else fitted.noise.state())
         return state | {f"chain.{name}": value for name, value in fitted.chain._asdict().items()}
 
     def load_state_dict(self, state: StateDict) -> None:
@@ -322,7 +339,8 @@ class DeepGPDynamics(Learner[_Fitted]):
         step_size = state.get("step_size", self.inference.step_size)
         if not isinstance(step_size, float) or not 0.0 < step_size < math.inf:
             raise ValueError(f"dynamics state 'step_size': expected a positive number, received {step_size!r}")
-        self._fitted = _Fitted(factorise_all(model), normalisers, chain, pool, oldest, step_size)
+        noise = take_noise_split(state, num_targets, device)
+        self._fitted = _Fitted(factorise_all(model), normalisers, chain, pool, oldest, step_size, noise)
 
     def _diagnostics(self, fitted: _Fitted) -> dict[str, float]:
         """Mixing of the kept samples (medians over coordinates), and the fitted noise and kernel scales."""
@@ -337,6 +355,13 @@ class DeepGPDynamics(Learner[_Fitted]):
         for index, layer in enumerate(model.layers):
             metrics[f"layer_{index + 1}_kernel_std"] = float(layer.variance.sqrt())
         return metrics
+
+
+def _posterior_mean(factorised: Factorised, pool: Float[Tensor, "num_samples V"]) -> Callable[[Tensor], Tensor]:
+    """The mean of the standardised targets over ten samples of the pool, which is ample for residuals."""
+    some = pool[:: -(-len(pool) // 10)]
+    whitened = factorised.model.split(some)
+    return lambda x: propagate_means(factorised, whitened, x.expand(len(some), -1, -1)).mean(0)
 
 
 def _report_nothing(done: int, total: int, loss: float) -> None:

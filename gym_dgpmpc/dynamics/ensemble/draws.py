@@ -27,11 +27,20 @@ class EnsembleSampler:
     """The draws `TSinf` and `TS1`: every particle by one network's mean and variance, fresh noise at each step.
 
     Particle p belongs to network p // (P / B). With ``shuffle`` the particles of each candidate are permuted before
-    a step and put back after it.
+    a step and put back after it. Of the variance that a network predicts, ``noise_share`` is drawn.
     """
 
-    def __init__(self, network: Ensemble, coordinates: Coordinates, generator: torch.Generator, *, shuffle: bool):
+    def __init__(
+        self,
+        network: Ensemble,
+        coordinates: Coordinates,
+        generator: torch.Generator,
+        *,
+        shuffle: bool,
+        noise_share: Float[Tensor, "T"],
+    ):
         self._network, self._coordinates, self._generator, self._shuffle = network, coordinates, generator, shuffle
+        self._noise_scale = noise_share.sqrt()
 
     @torch.no_grad()
     def __call__(
@@ -43,7 +52,8 @@ class EnsembleSampler:
             order = chance.argsort(0).unsqueeze(-1)
             x = x.gather(0, order.expand_as(x))
         mean, logvar = predict(self._network, x.reshape(len(self._network.weights[0]), -1, x.shape[-1]))
-        target = mean + torch.exp(0.5 * logvar) * normals_like(mean, self._generator)
+        std = torch.exp(0.5 * logvar).mul_(self._noise_scale)
+        target = mean + std * normals_like(mean, self._generator)
         target = target.view(*x.shape[:2], -1)
         if self._shuffle:
             target = torch.empty_like(target).scatter_(0, order.expand_as(target), target)
@@ -51,14 +61,19 @@ class EnsembleSampler:
 
 
 class CollapsedEnsemble:
-    """The ensemble as one Gaussian: E_b[mean_b] and E_b[variance_b] + Var_b[mean_b]."""
+    """The ensemble as one Gaussian: E_b[mean_b] and noise_share E_b[variance_b] + Var_b[mean_b].
 
-    def __init__(self, network: Ensemble, *, with_variance: bool):
-        self._network, self._with_variance = network, with_variance
+    Without a share it is the mean alone.
+    """
+
+    def __init__(self, network: Ensemble, noise_share: Float[Tensor, "T"] | None):
+        self._network, self._noise_share = network, noise_share
 
     def __call__(self, x: Float[Tensor, "P K D"]) -> Gaussian:
         num_members = len(self._network.weights[0])
         mean, logvar = predict(self._network, x.flatten(0, 1).expand(num_members, -1, -1))
-        variance = logvar.exp().mean(0) + mean.var(0, correction=0) if self._with_variance else None
         shape = x.shape[:2]
-        return Gaussian(mean.mean(0).unflatten(0, shape), None if variance is None else variance.unflatten(0, shape))
+        if self._noise_share is None:
+            return Gaussian(mean.mean(0).unflatten(0, shape), None)
+        variance = logvar.exp().mean(0) * self._noise_share + mean.var(0, correction=0)
+        return Gaussian(mean.mean(0).unflatten(0, shape), variance.unflatten(0, shape))

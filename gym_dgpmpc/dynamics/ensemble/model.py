@@ -18,6 +18,7 @@ from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.ensemble.draws import PROPAGATIONS, CollapsedEnsemble, EnsembleSampler, Propagation
 from gym_dgpmpc.dynamics.ensemble.network import (
     Ensemble,
+    Prediction,
     half_precision,
     initial_ensemble,
     layer_sizes,
@@ -27,6 +28,7 @@ from gym_dgpmpc.dynamics.ensemble.network import (
 )
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner
+from gym_dgpmpc.dynamics.noise import NoiseSplit, observed, take_noise_split
 from gym_dgpmpc.dynamics.state import take_normaliser, take_tensors
 from gym_dgpmpc.inference.adam import adam_memory
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
@@ -44,6 +46,7 @@ class _Fitted(NamedTuple):
     inputs: Normaliser
     moments: dict[str, _Moments]
     num_updates: int  # Adam steps over all trainings
+    noise: NoiseSplit | None = None  # None: not told apart
 
 
 class _Best(NamedTuple):
@@ -84,6 +87,9 @@ class EnsembleDynamics(Learner[_Fitted]):
             through its own for the whole plan; "DS", each by its own draw from the mean and variance of all; "MM", as
             DS, then a candidate's particles are replaced by draws from their mean and variance; "expectation", along
             the mean.
+        add_noise: draw the variance that the networks predict, as PETS does; otherwise their means alone.
+        split_noise: where ``add_noise`` is on, tell the sensors' noise, which only blurs what is observed, from the
+            process's, which adds up over a plan, as far as the data show it; otherwise all of it adds up.
         half_precision: compute the layers between the first and the last in bfloat16 in rollouts; several times faster
             on processors with instructions for it, and off by some 0.3 % of a prediction.
         dtype: precision of all else in rollouts; networks are trained in float32.
@@ -111,6 +117,8 @@ class EnsembleDynamics(Learner[_Fitted]):
         num_epochs: int = 5,
         patience: int | None = None,
         draw: Propagation = "TSinf",
+        add_noise: bool = True,
+        split_noise: bool = False,
         half_precision: bool = False,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
@@ -133,7 +141,8 @@ class EnsembleDynamics(Learner[_Fitted]):
             raise ValueError(f"learning_rate must be positive, received {learning_rate}")
         if draw not in PROPAGATIONS:
             raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(PROPAGATIONS)}")
-        super().__init__(observation_size, action_size, observation_spec, dtype, device)
+        noise = {"add_noise": add_noise, "split_noise": split_noise}
+        super().__init__(observation_size, action_size, observation_spec, dtype, device, **noise)
         self.num_members, self.weight_decay, self.learning_rate = num_members, tuple(weight_decay), learning_rate
         self.batch_size, self.num_epochs, self.patience, self.draw_kind = batch_size, num_epochs, patience, draw
         self.sizes = layer_sizes(self.encoder.input_size, num_hidden_layers, hidden_size, self.encoder.target_size)
@@ -152,16 +161,23 @@ class EnsembleDynamics(Learner[_Fitted]):
             network = initial_ensemble(self.num_members, self.sizes, generator, self.device)
             moments, updates = dict[str, _Moments](), 0
         else:
-            network, _, moments, updates = self._fitted
-        self._fitted, last_loss = self._train(network, moments, updates, inputs, x, y, generator)
-        with torch.no_grad():
-            mean, logvar = predict(self._fitted.network, x.expand(self.num_members, -1, -1))
+            network, _, moments, updates, _ = self._fitted
+        trained, last_loss = self._train(network, moments, updates, inputs, x, y, generator)
+
+        @torch.no_grad()
+        def predicted(x: Tensor) -> Prediction:
+            return predict(trained.network, x.float().expand(self.num_members, -1, -1))
+
+        mean, logvar = predicted(x)
+        normalisers, aleatoric = (inputs, _unit(y.shape[1], self.device)), logvar.exp().mean((0, 1))
+        noise = self._split_noise(data, normalisers, lambda x: predicted(x).mean.mean(0).double(), aleatoric)
+        self._fitted = trained._replace(noise=noise)
         return {
             "loss": last_loss,
             "rmse": float((mean.mean(0) - y).square().mean().sqrt()),
             "aleatoric_std": float(torch.exp(0.5 * logvar).mean()),
             "disagreement": float(mean.std(0, correction=0).mean()),
-        }
+        } | self._noise_metrics(noise, normalisers[1], aleatoric)
 
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """Do nothing: the networks are trained between episodes only.
@@ -185,6 +201,8 @@ class EnsembleDynamics(Learner[_Fitted]):
         )
         network = half_precision(network) if self.half_precision else network
         coordinates = Coordinates(self.encoder, fitted.inputs, _unit(self.encoder.target_size, self.device), self.dtype)
+        drawn = self._drawn_noise(fitted.noise)
+        share, blur = drawn.process_share.to(self.dtype), drawn.observation(self.encoder)
         if self.draw_kind in ("TS1", "TSinf"):
             if num_particles < 1 or num_particles % self.num_members:
                 raise ValueError(
@@ -192,24 +210,24 @@ class EnsembleDynamics(Learner[_Fitted]):
                     f"{self.num_members} networks, received {num_particles}"
                 )
             shuffle = self.draw_kind == "TS1" and self.num_members > 1
-            return EnsembleSampler(network, coordinates, generator, shuffle=shuffle)
-        return GaussianSampler(
-            CollapsedEnsemble(network, with_variance=self.draw_kind != "expectation"),
-            coordinates,
-            generator,
-            match_moments=self.draw_kind == "MM",
-        )
+            by_networks = EnsembleSampler(network, coordinates, generator, shuffle=shuffle, noise_share=share)
+            return observed(by_networks, blur, generator)
+        if self.draw_kind == "expectation":
+            return GaussianSampler(CollapsedEnsemble(network, None), coordinates, generator)
+        collapsed, match_moments = CollapsedEnsemble(network, share), self.draw_kind == "MM"
+        sampler = GaussianSampler(collapsed, coordinates, generator, match_moments=match_moments)
+        return observed(sampler, blur, generator)
 
     def state_dict(self) -> StateDict:
         """Networks, input normaliser and what Adam remembers; empty before the first fit."""
         if self._fitted is None:
             return {}
-        network, inputs, moments, num_updates = self._fitted
+        network, inputs, moments, num_updates, noise = self._fitted
         state: StateDict = {**network.parameters(), "adam.num_updates": num_updates}
         state |= {f"inputs.{key}": value for key, value in inputs._asdict().items()}
         for name, pair in moments.items():
             state |= {f"adam.{name}.{key}": value for key, value in pair._asdict().items()}
-        return state
+        return state if noise is None else state | noise.state()
 
     def load_state_dict(self, state: StateDict) -> None:
         """Restore `state_dict` of a model with the same settings.
@@ -236,7 +254,8 @@ class EnsembleDynamics(Learner[_Fitted]):
             raise ValueError(
                 f"dynamics state 'adam.num_updates': expected a positive integer, received {num_updates!r}"
             )
-        self._fitted = _Fitted(network, inputs, moments, num_updates)
+        noise = take_noise_split(state, self.encoder.target_size, device)
+        self._fitted = _Fitted(network, inputs, moments, num_updates, noise)
 
     def _train(
         self,

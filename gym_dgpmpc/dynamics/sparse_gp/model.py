@@ -19,6 +19,7 @@ from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp.start import NOISE_VARIANCE, restandardise
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner
+from gym_dgpmpc.dynamics.noise import NoiseSplit, observed, take_noise_split
 from gym_dgpmpc.dynamics.sparse_gp.moment_matching import MomentMatchingSampler
 from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.gp.deep_gp import DeepGP
@@ -37,6 +38,7 @@ class _Fitted(NamedTuple):
     model: DeepGP  # of one layer
     normalisers: tuple[Normaliser, Normaliser]
     posterior: SparsePosterior
+    noise: NoiseSplit | None = None  # None: not told apart
 
 
 class SparseGPDynamics(Learner[_Fitted]):
@@ -59,7 +61,9 @@ class SparseGPDynamics(Learner[_Fitted]):
         draw: how particles move: "DS", each by its own draw from the Gaussian at its place; "MM", as DS, then the
             particles of a candidate are replaced by draws from their mean and variance; "AMM", a Gaussian per
             candidate through its exact moments (kernel "rbf", more particles than an observation has numbers).
-        add_noise: draw the observations' noise too; PETS draws the function alone.
+        add_noise: draw the fitted noise too, so that plans reckon with it: for plants or sensors that are noisy.
+        split_noise: where ``add_noise`` is on, tell the sensors' noise, which only blurs what is observed, from the
+            process's, which adds up over a plan, as far as the data show it; otherwise all of it adds up.
         update_within_episode: condition on each new transition at once, hyperparameters and inducing inputs frozen (if
             exact, each is one more inducing input); PETS does so between episodes only.
         dtype: precision of a rollout's states; the model itself computes in float64.
@@ -84,6 +88,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         max_training_iterations: int = 200,
         draw: GPDraw = "DS",
         add_noise: bool = False,
+        split_noise: bool = True,
         update_within_episode: bool = False,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
@@ -99,10 +104,11 @@ class SparseGPDynamics(Learner[_Fitted]):
                 "the draw AMM has no closed forms for vectors that turn with a heading: use the draw MM, or leave out "
                 f"body_frame, received body_frame={observation_spec.body_frame}"
             )
-        super().__init__(observation_size, action_size, observation_spec, dtype, device)
+        noise = {"add_noise": add_noise, "split_noise": split_noise}
+        super().__init__(observation_size, action_size, observation_spec, dtype, device, **noise)
         self.num_inducing, self.exact = num_inducing, exact
         self.max_training_iterations = max_training_iterations
-        self.draw_kind, self.add_noise, self.update_within_episode = draw, add_noise, update_within_episode
+        self.draw_kind, self.update_within_episode = draw, update_within_episode
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """Maximise the collapsed bound, then condition on all transitions.
@@ -119,13 +125,20 @@ class SparseGPDynamics(Learner[_Fitted]):
             free_inducing_inputs=not self.exact,
             on_progress=self.on_progress,
         )
-        self._condition(found.model, normalisers, standardised)
+        variance = found.model.noise_variance
+        posterior = sparse_posterior(found.model.layers[0], variance, *standardised)
+
+        def predict(x: Tensor) -> Tensor:
+            return sparse_predict(found.model.layers[0], variance, posterior, x)[0]
+
+        noise = self._split_noise(data, normalisers, predict, variance)
+        self._fitted = _Fitted(found.model, normalisers, posterior, noise)
         return {
             "bound": found.bound,
             "evaluations": float(found.num_evaluations),
-            "noise_std": float(found.model.noise_variance.sqrt().mean()),
+            "noise_std": float(variance.sqrt().mean()),
             "kernel_std": float(found.model.layers[0].variance.sqrt()),
-        }
+        } | self._noise_metrics(noise, normalisers[1], variance)
 
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """Condition on the grown data if ``update_within_episode``; otherwise do nothing.
@@ -133,13 +146,15 @@ class SparseGPDynamics(Learner[_Fitted]):
         Raises:
             RuntimeError: the model was not fitted.
         """
-        model, normalisers, _ = self._require_fit("resample")
+        fitted = self._require_fit("resample")
+        model, normalisers = fitted.model, fitted.normalisers
         if self.update_within_episode:
             x, y = self._encode(data)
             standardised = Data(normalisers[0](x), normalisers[1](y))
             if self.exact:  # the new transitions are inducing points too
                 model = model._replace(layers=(model.layers[0]._replace(inducing_inputs=standardised.x),))
-            self._condition(model, normalisers, standardised)
+            posterior = sparse_posterior(model.layers[0], model.noise_variance, *standardised)
+            self._fitted = fitted._replace(model=model, posterior=posterior)
         return {}
 
     def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
@@ -149,26 +164,28 @@ class SparseGPDynamics(Learner[_Fitted]):
             RuntimeError: the model was not fitted.
             ValueError: there are too few particles for "AMM".
         """
-        model, normalisers, posterior = self._require_fit("draw")
-        noise = model.noise_variance if self.add_noise else torch.zeros_like(model.noise_variance)
+        model, normalisers, posterior, found = self._require_fit("draw")
+        drawn = self._drawn_noise(found)
+        noise = model.noise_variance * drawn.process_share
         if self.draw_kind == "AMM":
-            predictor = _predictor(model, posterior)
-            return MomentMatchingSampler(predictor, self.encoder, *normalisers, noise, num_particles, generator)
+            predictor, blur = _predictor(model, posterior), drawn.observation(self.encoder)
+            return MomentMatchingSampler(predictor, self.encoder, *normalisers, noise, num_particles, generator, blur)
 
         def predict(x: Tensor) -> Gaussian:
             mean, variance = sparse_predict(model.layers[0], model.noise_variance, posterior, x.double())
             return Gaussian(mean, variance + noise)
 
         coordinates = Coordinates(self.encoder, *normalisers, self.dtype)
-        return GaussianSampler(predict, coordinates, generator, match_moments=self.draw_kind == "MM")
+        sampler = GaussianSampler(predict, coordinates, generator, match_moments=self.draw_kind == "MM")
+        return observed(sampler, drawn.observation(self.encoder), generator)
 
     def state_dict(self) -> StateDict:
         """Hyperparameters, normalisers and the posterior; empty before the first fit."""
         if self._fitted is None:
             return {}
-        model, normalisers, posterior = self._fitted
+        model, normalisers, posterior, noise = self._fitted
         state: StateDict = {**model.layers[0].parameters(), "log_noise": model.log_noise}
-        state |= normalisers_state(*normalisers)
+        state |= normalisers_state(*normalisers) | ({} if noise is None else noise.state())
         return state | {f"posterior.{key}": value for key, value in posterior._asdict().items()}
 
     def load_state_dict(self, state: StateDict) -> None:
@@ -193,7 +210,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         )
         shapes = dict(zip(SparsePosterior._fields, ((count, count), (count,), (count, sizes[1])), strict=True))
         posterior = SparsePosterior(**take_tensors(state, shapes, device, prefix="posterior."))
-        self._fitted = _Fitted(model, normalisers, posterior)
+        self._fitted = _Fitted(model, normalisers, posterior, take_noise_split(state, sizes[1], device))
 
     def _start(self, data: Data, normalisers: tuple[Normaliser, Normaliser], generator: torch.Generator) -> DeepGP:
         """Hyperparameters of the last training in the new standardisation, or fixed ones; fresh inducing inputs."""
@@ -207,10 +224,6 @@ class SparseGPDynamics(Learner[_Fitted]):
         outputs = data.y.new_zeros(last.model.num_whitened())  # the inducing outputs are not carried over
         model, _ = restandardise(last.model, outputs, last.normalisers, normalisers)
         return model._replace(layers=(model.layers[0]._replace(inducing_inputs=inducing),))
-
-    def _condition(self, model: DeepGP, normalisers: tuple[Normaliser, Normaliser], data: Data) -> None:
-        posterior = sparse_posterior(model.layers[0], model.noise_variance, *data)
-        self._fitted = _Fitted(model, normalisers, posterior)
 
 
 def _predictor(model: DeepGP, posterior: SparsePosterior) -> Predictor:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.dynamics.noise import ObservationNoise
 from gym_dgpmpc.gp.moments import Predictor, predicted_moments
 
 
@@ -80,6 +81,9 @@ class MomentMatchingSampler:
         noise_variance: added to the (standardised) targets' variance.
         num_particles: P, at least S + 1: fewer points cannot have a covariance of full rank.
         generator: for the directions in which the particles are spread, drawn once.
+        blur: the noise that states are observed with, if any. The particles' covariance is then that of what is
+            observed, from which the noise's is taken off before a step; at the first step, where nothing is spread yet,
+            it is added.
 
     Raises:
         ValueError: there are too few particles.
@@ -94,6 +98,7 @@ class MomentMatchingSampler:
         noise_variance: Float[Tensor, "T"],
         num_particles: int,
         generator: torch.Generator,
+        blur: ObservationNoise | None = None,
     ):
         size = encoder.observation_size
         if num_particles <= size:
@@ -104,6 +109,7 @@ class MomentMatchingSampler:
         self._predictor, self._encoder, self._inputs, self._targets = predictor, encoder, inputs, targets
         self._noise = noise_variance
         self._frame = orthonormal_frame(num_particles, size, generator).to(inputs.mean)
+        self._blur = blur
         self._carried = encoder.carried.to(inputs.mean)
 
     @torch.no_grad()
@@ -116,7 +122,16 @@ class MomentMatchingSampler:
         mean = states.mean(0)
         deviation = (states - mean).transpose(0, 1)
         actions = action.to(states).masked_fill(lost, 0.0)
-        mean, covariance = self.propagate(mean, deviation.mT @ deviation / len(states), actions)
+        covariance = deviation.mT @ deviation / len(states)
+        if self._blur is not None and step == 0:
+            covariance = covariance + torch.diag(self._blur.start_std.square())
+        elif self._blur is not None:
+            stretch = 1.0 + self._blur.stretch
+            covariance = _without(covariance, torch.diag(self._blur.std.square())) * stretch.unsqueeze(-1) * stretch
+            mean = self._blur.fed(mean)
+        mean, covariance = self.propagate(mean, covariance, actions)
+        if self._blur is not None:
+            covariance = covariance + torch.diag(self._blur.std.square())
         values, vectors = torch.linalg.eigh(covariance)
         root = vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)  # rounding leaves values below zero
         spread = torch.einsum("ps,kts->pkt", self._frame, root)
@@ -143,6 +158,12 @@ class MomentMatchingSampler:
         rows = torch.tensor(predicted, dtype=torch.int64, device=mean.device)
         next_covariance[:, rows.unsqueeze(-1), rows] += change
         return next_mean, 0.5 * (next_covariance + next_covariance.mT)
+
+
+def _without(covariance: Float[Tensor, "K S S"], part: Float[Tensor, "S S"]) -> Float[Tensor, "K S S"]:
+    """The difference of two covariances, without the negative values that rounding leaves of zero."""
+    values, vectors = torch.linalg.eigh(covariance - part)
+    return (vectors * values.clamp_min(0.0).unsqueeze(-2)) @ vectors.mT
 
 
 def orthonormal_frame(num_particles: int, size: int, generator: torch.Generator) -> Float[Tensor, "P S"]:

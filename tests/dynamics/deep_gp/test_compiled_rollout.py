@@ -15,6 +15,7 @@ from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp.draws import CompiledPathwiseSampler, PathwiseSampler, Posterior
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics, compiled_rollout
+from gym_dgpmpc.dynamics.noise import ObservationNoise
 from gym_dgpmpc.gp.deep_gp import factorise_all
 from gym_dgpmpc.gp.kernels import KERNELS, RBF
 from gym_dgpmpc.planning.rollout import rollout
@@ -37,7 +38,17 @@ pytestmark = pytest.mark.skipif(not compiled_rollout.is_available(), reason="no 
 class Draw:
     """The same functions, drawn from the same generator, as compiled code and as PyTorch in two precisions."""
 
-    def __init__(self, kernel, num_layers, spec=SPECS[1], refresh="step", num_inducing=13, num_features=21, offset=0.0):
+    def __init__(
+        self,
+        kernel,
+        num_layers,
+        spec=SPECS[1],
+        refresh="step",
+        num_inducing=13,
+        num_features=21,
+        offset=0.0,
+        with_noise=False,
+    ):
         generator = seeded(3)
         encoder = Encoder(3, 2, spec)
         # Small steps: the rounding of one step is not to be amplified much by the next ones.
@@ -54,12 +65,19 @@ class Draw:
         whitened = model.split(normal(generator, PARTICLES, model.num_whitened()))
         posterior = Posterior(factorise_all(model), whitened)
 
+        noise = None
+        if with_noise:
+            predicted, centre = torch.zeros(3).double(), normal(generator, 3) + offset
+            predicted[encoder.predicted] = 1.0
+            blur = ObservationNoise(0.3 * predicted, 0.1 * predicted, centre)
+            noise = torch.full((encoder.target_size,), 0.2).double(), blur
+
         def sampler(dtype):
             coordinates = Coordinates(encoder, inputs, targets, dtype)
-            return PathwiseSampler(posterior, coordinates, HORIZON, num_features, refresh, dtype, seeded())
+            return PathwiseSampler(posterior, coordinates, HORIZON, num_features, refresh, dtype, seeded(), noise)
 
         single = Coordinates(encoder, inputs, targets, torch.float32)
-        self.compiled = CompiledPathwiseSampler(posterior, single, HORIZON, num_features, refresh, seeded())
+        self.compiled = CompiledPathwiseSampler(posterior, single, HORIZON, num_features, refresh, seeded(), noise)
         self.single, self.double = sampler(torch.float32), sampler(torch.float64)
         self.observation = normal(generator, 3).float()
         self.generator = generator
@@ -89,6 +107,24 @@ def test_is_as_exact_as_pytorch_in_single_precision(kernel, num_layers, spec, re
     compiled, by_torch = errors(draw, draw.actions(40))
     # Rounding differs, its size does not: the state's magnitude times that of the weights, in units of 6e-8.
     assert compiled < max(10 * by_torch, 1e-5)
+
+
+@pytest.mark.parametrize("spec", SPECS)
+@pytest.mark.parametrize("refresh", ["step", "plan"])
+def test_is_as_exact_with_noise(spec, refresh):
+    draw = Draw("matern32", 2, spec, refresh, with_noise=True)
+    actions = draw.actions(40)
+    compiled, by_torch = errors(draw, actions)
+    assert compiled < max(10 * by_torch, 1e-5)
+    constant = list(spec.constant)
+    states = draw.compiled.trajectories(draw.observation, actions)
+    assert torch.equal(states[..., constant], draw.observation[constant].expand(*states.shape[:3], -1))
+    # The same luck for all candidates, and not that of the other particles.
+    alike = draw.compiled.trajectories(draw.observation, actions[:1].expand(3, -1, -1))
+    assert torch.equal(alike[:, :, 0], alike[:, :, 2])
+    silent = Draw("matern32", 2, spec, refresh).compiled.trajectories(draw.observation, actions)
+    others = [i for i in range(3) if i not in constant]
+    assert ((states - silent)[1:, ..., others].abs().amax((0, 2)) > 1e-3).all()
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -219,9 +255,10 @@ def test_the_argument_may_be_a_view_of_another_precision():
 
 
 @pytest.mark.parametrize("spec", SPECS[:3])
-def test_float64_states_far_from_zero_are_as_exact_as_near_it(spec):
+@pytest.mark.parametrize("with_noise", [False, True])
+def test_float64_states_far_from_zero_are_as_exact_as_near_it(spec, with_noise):
     offset = torch.tensor([1e6, 2 * math.pi * 1e6, 5e5], dtype=torch.float64)
-    draw = Draw("matern32", 2, spec, offset=offset)
+    draw = Draw("matern32", 2, spec, offset=offset, with_noise=with_noise)
     observation, actions = draw.observation.double() + offset, draw.actions(20)
     for sampler in (draw.compiled, draw.single):
         found = rollout(sampler, observation, actions, PARTICLES)
@@ -250,8 +287,15 @@ def test_functions_for_a_whole_plan_serve_one_of_any_length():
     assert sampler.trajectories(torch.zeros(3), torch.zeros(4, 2 * HORIZON, 2)).isfinite().all()
 
 
+def test_noise_is_drawn_for_so_many_steps():
+    sampler = Draw("rbf", 1, refresh="plan", with_noise=True).compiled
+    with pytest.raises(ValueError, match=rf"actions .*\b{HORIZON}\b.*\b{HORIZON + 1}\b"):
+        sampler.trajectories(torch.zeros(3), torch.zeros(4, HORIZON + 1, 2))
+
+
 @pytest.mark.parametrize("refresh", ["step", "plan"])
-def test_the_model_draws_compiled_worlds_and_plans_alike_without(refresh):
+@pytest.mark.parametrize("add_noise", [False, True])
+def test_the_model_draws_compiled_worlds_and_plans_alike_without(refresh, add_noise):
     generator = seeded()
     observation, action = normal(generator, 60, 3).float(), normal(generator, 60, 2).float()
     data = Transitions(observation, action, observation + 0.1 * observation.flip(1).tanh())
@@ -265,6 +309,7 @@ def test_the_model_draws_compiled_worlds_and_plans_alike_without(refresh):
             first_training_iterations=20,
             num_samples=5,
             refresh=refresh,
+            add_noise=add_noise,
             compile=compile,
         )
         model.fit(data, seeded(1))

@@ -118,7 +118,7 @@ def test_the_exact_model_within_an_episode_is_exact_too():
     """Where no transition was when it was trained, it predicts what the same hyperparameters give with all of them."""
     grown = noisy(60, 0.02)
     model = fitted(data=Transitions(*(field[:30] for field in grown)), exact=True, update_within_episode=True)
-    _, normalisers, _ = model._fitted
+    normalisers = model._fitted.normalisers
     model.resample(grown, seeded())
     layer, noise = model._fitted.model.layers[0], model._fitted.model.noise_variance
     x, y = (normalise(raw) for normalise, raw in zip(normalisers, model._encode(grown), strict=True))

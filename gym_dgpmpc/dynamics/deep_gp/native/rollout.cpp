@@ -65,7 +65,10 @@ struct Task {
   int64_t num_vectors;
   const int64_t *vectors;       // [num_vectors, 3]: where heading, x and y are; what is added to x, y is along the body
   const Layer *layers;                                 // [L]
-  const float *start;                                  // [S]
+  const float *noise;                                  // [H', P, T], H' >= H, added to the last layer; or null
+  const float *stretch, *centre;                       // [S], or null: from the second step on a state s enters the
+                                                       // step as s + stretch (s - centre)
+  const float *start;                                  // [P, S]
   const float *actions;                                // [K, H, A]
   float *states;                                       // [H + 1, P, K, S]
 };
@@ -329,7 +332,7 @@ void run(const Task &task, int64_t particle, int64_t first, int64_t last, vec *s
   const int64_t row = task.num_particles * task.num_candidates * size;
   for (int64_t b = 0; b < blocks; b++) {
     for (int64_t s = 0; s < size; s++)
-      for (int v = 0; v < VECTORS; v++) states[(b * size + s) * VECTORS + v] = all(task.start[s]);
+      for (int v = 0; v < VECTORS; v++) states[(b * size + s) * VECTORS + v] = all(task.start[particle * size + s]);
   }
   for (int64_t step = 0; step <= task.horizon; step++) {
     // Steps outside, blocks inside: a step's functions are read once, and stay in the cache for all blocks.
@@ -339,6 +342,10 @@ void run(const Task &task, int64_t particle, int64_t first, int64_t last, vec *s
       vec *state = states + b * size * VECTORS;
       store(state, size, count, task.states + step * row + (particle * task.num_candidates + point) * size);
       if (step == task.horizon) continue;
+      if (task.stretch && step > 0)
+        for (int64_t s = 0; s < size; s++)
+          for (int v = 0; v < VECTORS; v++)
+            state[s * VECTORS + v] += (state[s * VECTORS + v] - task.centre[s]) * task.stretch[s];
       const int64_t function = (task.num_functions == 1 ? 0 : step) * task.num_particles + particle;
       encode(task, state, task.actions + (point * task.horizon + step) * task.action_size, count, input);
       for (int64_t l = 0; l < task.num_layers; l++) {
@@ -351,6 +358,12 @@ void run(const Task &task, int64_t particle, int64_t first, int64_t last, vec *s
             layer.feature_out + function * layer.outputs * task.num_features, scaled, out);
         if (l + 1 < task.num_layers)
           for (int64_t i = 0; i < inputs * VECTORS; i++) input[i] += out[i];
+      }
+      if (task.noise) {
+        const int64_t outputs = task.layers[task.num_layers - 1].outputs;
+        const float *noise = task.noise + (step * task.num_particles + particle) * outputs;
+        for (int64_t o = 0; o < outputs; o++)
+          for (int v = 0; v < VECTORS; v++) out[o * VECTORS + v] += noise[o];
       }
       decode(task, out, state, moved);
     }
