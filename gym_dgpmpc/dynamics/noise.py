@@ -226,7 +226,7 @@ class PathNoise(NamedTuple):
     @classmethod
     def draw(
         cls,
-        process_std: Float[Tensor, "T"],
+        process_std: Float[Tensor, "P T"],
         observation: ObservationNoise | None,
         horizon: int,
         num_particles: int,
@@ -234,7 +234,7 @@ class PathNoise(NamedTuple):
         generator: torch.Generator,
     ) -> "PathNoise":
         def normals(length: int, std: Tensor) -> Tensor:
-            shape = length, num_particles, len(std)
+            shape = length, num_particles, std.shape[-1]
             # In single precision as the functions' own, so that the precision of a rollout does not change its noise.
             drawn = torch.randn(shape, generator=generator, dtype=torch.float32, device=std.device)
             return std.to(dtype) * drawn.to(dtype)

@@ -41,7 +41,8 @@ class DeepGP(NamedTuple):
     def whitened_shapes(self) -> list[tuple[int, int]]:
         """(M_l, O_l) of each layer's whitened inducing outputs."""
         return [
-            (layer.inducing_inputs.shape[-2], size) for layer, size in zip(self.layers, self.output_sizes(), strict=True)
+            (layer.inducing_inputs.shape[-2], size)
+            for layer, size in zip(self.layers, self.output_sizes(), strict=True)
         ]
 
     def split(self, whitened: Float[Tensor, "*p V"]) -> list[Tensor]:

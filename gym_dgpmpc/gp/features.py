@@ -1,11 +1,12 @@
 """Random Fourier features: finite-dimensional draws of a stationary Gaussian process's prior.
 
 Sits beside `kernels.py`; the pathwise draws of a trained model are built from them. A stationary kernel is the
-Fourier transform of a spectral density (Bochner), so with frequencies from that density and uniform phases,
-phi_i(x) = sqrt(2 / F) cos(omega_i . x / lengthscale + b_i) has E[phi(x) . phi(x')] = k(x, x')
-(Rahimi and Recht 2007), with an error of order F^-1/2.
+Fourier transform of a spectral density (Bochner), so with frequencies omega from that density, each used for a cosine
+and a sine, phi(x) = sqrt(2 / F) (cos(omega . x / lengthscale), sin(omega . x / lengthscale)) has
+E[phi(x) . phi(x')] = k(x, x') (Rahimi and Recht 2007), with an error of order F^-1/2, and |phi(x)| = 1 exactly.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -16,20 +17,32 @@ from gym_dgpmpc.gp.kernels import Kernel
 
 
 class Features(NamedTuple):
-    """Frequencies for unit lengthscales, and phases, of F random features over D inputs."""
+    """Frequencies for unit lengthscales, and phases, of F random features over D inputs, for each of P draws."""
 
-    frequency: Float[Tensor, "F D"]
+    frequency: Float[Tensor, "P F D"]
     phase: Float[Tensor, "F"]
 
-    def __call__(self, x: Float[Tensor, "*b D"]) -> Float[Tensor, "*b F"]:
+    def __call__(self, x: Float[Tensor, "P n D"]) -> Float[Tensor, "P n F"]:
         """phi(x) for inputs already divided by the lengthscales; unit kernel variance."""
         return torch.cos(x @ self.frequency.mT + self.phase) * (2.0 / self.phase.numel()) ** 0.5
 
 
 def draw_features(
-    kernel: Kernel, num_features: int, input_size: int, generator: torch.Generator, dtype: torch.dtype = torch.float64
+    kernel: Kernel,
+    num_draws: int,
+    num_features: int,
+    input_size: int,
+    generator: torch.Generator,
+    dtype: torch.dtype = torch.float64,
 ) -> Features:
-    """Frequencies from the kernel's spectral density, phases uniform over a turn."""
-    frequency = kernel.draw_frequencies(num_features, input_size, generator, dtype)
-    phase = 2 * torch.pi * torch.rand(num_features, generator=generator, dtype=dtype, device=generator.device)
+    """F features for each of P draws: F / 2 frequencies from the spectral density, each with the phases 0 and -pi / 2.
+
+    Args:
+        num_features: F, a multiple of 2.
+    """
+    half = num_features // 2
+    frequency = kernel.draw_frequencies(num_draws * half, input_size, generator, dtype)
+    frequency = frequency.view(num_draws, half, input_size).repeat(1, 2, 1)
+    phase = torch.zeros(num_features, dtype=dtype, device=generator.device)
+    phase[half:] = -0.5 * math.pi
     return Features(frequency, phase)

@@ -9,7 +9,6 @@ points have too, before their own.
 
 from typing import NamedTuple
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 

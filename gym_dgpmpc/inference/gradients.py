@@ -11,7 +11,6 @@ The model, layer by layer, of a datum x with the latents e_l ~ N(0, I) of its in
 with m_l, s_l^2 the conditional moments given the layer's inducing outputs (`gp.layer.conditional`).
 """
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -128,7 +128,7 @@ class ChainState(NamedTuple):
 
 def flatten(parameters: list[Tensor]) -> Float[Tensor, "C H"]:
     """The tensors of each chain in one row."""
-    return torch.cat([tensor.flatten(1) for tensor in parameters], dim=1)
+    return torch.cat([tensor.reshape(len(tensor), -1) for tensor in parameters], dim=1)
 
 
 def with_flat(model: DeepGP, flat: Float[Tensor, "C H"]) -> DeepGP:
@@ -142,19 +142,21 @@ def initial_state(
     model: DeepGP, whitened: Float[Tensor, "C V"], num_data: int, generator: torch.Generator
 ) -> ChainState:
     """Chains at rest, their latents drawn from the prior."""
-    state = ChainState(sghmc.init(whitened), sghmc.init(flatten(model.parameters())), [])
-    empty = [whitened.new_empty(len(whitened), 0, layer.inducing_inputs.shape[-1]) for layer in model.layers[:-1]]
-    return with_latents(state._replace(latents=empty), num_data, generator)
+    none = [whitened.new_empty(len(whitened), 0, layer.inducing_inputs.shape[-1]) for layer in model.layers[:-1]]
+    parameters = sghmc.init(flatten(model.parameters()))
+    return ChainState(sghmc.init(whitened), parameters, with_latents(none, num_data, generator))
 
 
-def with_latents(state: ChainState, num_data: int, generator: torch.Generator) -> ChainState:
-    """The state with latents for grown data: those of new rows are drawn from the prior."""
+def with_latents(
+    latents: list[Float[Tensor, "C n D"]], num_data: int, generator: torch.Generator
+) -> list[Float[Tensor, "C N D"]]:
+    """Latents for grown data: those of new rows are drawn from the prior."""
     grown = []
-    for latent in state.latents:
+    for latent in latents:
         shape = (latent.shape[0], num_data - latent.shape[1], latent.shape[2])
         new = torch.randn(shape, generator=generator, dtype=latent.dtype, device=latent.device)
         grown.append(torch.cat([latent, new], dim=1))
-    return state._replace(latents=grown)
+    return grown
 
 
 class Chains:
@@ -168,7 +170,9 @@ class Chains:
         num_burn_in: iterations in which Adam moves the hyperparameters; of "sampled" ones, SG-HMC does after them.
     """
 
-    def __init__(self, model: DeepGP, state: ChainState, data: DataSource, settings: InferenceSettings, num_burn_in: int):
+    def __init__(
+        self, model: DeepGP, state: ChainState, data: DataSource, settings: InferenceSettings, num_burn_in: int
+    ):
         self._kernels, self.data, self.settings, self._num_burn_in = model, data, settings, num_burn_in
         self.state = state
         self._flat = state.parameters.position.clone()
@@ -297,9 +301,7 @@ class Chains:
         of_parameters: bool,
     ) -> Gradients:
         whitened = self.factorised.model.split(position)
-        return gradients(
-            self.factorised, self._terms, whitened, passed, latents, batch.y, of_parameters=of_parameters
-        )
+        return gradients(self.factorised, self._terms, whitened, passed, latents, batch.y, of_parameters=of_parameters)
 
     def _at_window(self, batch: Data, index: Int[Tensor, "n"] | None, generator: torch.Generator) -> Gradients:
         """Gradients at a position drawn from the window."""
@@ -404,7 +406,9 @@ def move_latents(
     return [take_passed(layer, rows) for layer in passed], [take(latent, rows) for latent in both]
 
 
-def sample(chains: Chains, num_samples: int, spacing: int, generator: torch.Generator) -> Iterator[Float[Tensor, "C V"]]:
+def sample(
+    chains: Chains, num_samples: int, spacing: int, generator: torch.Generator
+) -> Iterator[Float[Tensor, "C V"]]:
     """Go on with frozen hyperparameters and preconditioners; yield the positions every ``spacing`` steps."""
     for _ in range(num_samples):
         for _ in range(spacing):

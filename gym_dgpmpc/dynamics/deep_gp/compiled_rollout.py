@@ -34,11 +34,11 @@ class PathwiseLayer(NamedTuple):
     """One layer's functions, ready for a rollout: two products in, two out, in the rollout's precision."""
 
     kernel: Kernel
-    inverse_lengthscale: Float[Tensor, "D"]
-    centres: Float[Tensor, "D M"]  # from x to the kernel's argument, with ...
-    offsets: Float[Tensor, "M"]  # ... and the factor of |x|^2, which is the kernel's `argument_scale`
-    frequencies: Float[Tensor, "D F"]  # from x to the features' phases, in turns
-    phases: Float[Tensor, "F"]
+    inverse_lengthscale: Float[Tensor, "P D"]
+    centres: Float[Tensor, "P D M"]  # from x to the kernel's argument, with ...
+    offsets: Float[Tensor, "P M"]  # ... and the factor of |x|^2, which is the kernel's `argument_scale`
+    frequencies: Float[Tensor, "P D F"]  # from x to the features' phases, in turns
+    phases: Float[Tensor, "P F"]
     kernel_out: Float[Tensor, "T P O M"]  # sigma^2 alpha; T = H with refresh="step", else 1
     feature_out: Float[Tensor, "T P O F"]  # sigma sqrt(2 / F) w
 
@@ -329,6 +329,6 @@ def _padded(layer: PathwiseLayer, units: int) -> PathwiseLayer:
     return layer._replace(**padded)
 
 
-def _blocks(weights: Float[Tensor, "D n"], units: int) -> Float[Tensor, "blocks D units"]:
+def _blocks(weights: Float[Tensor, "P D n"], units: int) -> Float[Tensor, "P blocks D units"]:
     """Columns grouped as the compiled code reads them."""
-    return weights.unflatten(1, (-1, units)).movedim(1, 0)
+    return weights.unflatten(2, (-1, units)).movedim(2, 1)

@@ -31,14 +31,14 @@ DRAWS: tuple[Draw, ...] = get_args(Draw)
 REFRESHES: tuple[Refresh, ...] = get_args(Refresh)
 
 
-Noise = tuple[Float[Tensor, "T"], ObservationNoise | None]
+Noise = tuple[Float[Tensor, "P T"], ObservationNoise | None]
 """The standard deviation of the process noise, in standardised targets, and the observation noise, if any."""
 
 
 class Posterior(NamedTuple):
-    """What a draw is made from: hyperparameters with factors L_z, and one whitened sample per particle, per layer."""
+    """What a draw is made from: for each particle the hyperparameters of its chain, factors L_z, a whitened sample."""
 
-    factorised: Factorised
+    factorised: Factorised  # of P models
     whitened: list[Float[Tensor, "P M O"]]
 
 
@@ -57,7 +57,7 @@ class ConditionalSampler:
         generator: torch.Generator,
         *,
         joint: bool,
-        noise_std: Float[Tensor, "T"] | None = None,
+        noise_std: Float[Tensor, "P T"] | None = None,
     ):
         self._posterior, self._coordinates, self._generator, self._joint = posterior, coordinates, generator, joint
         self._noise_std = noise_std
@@ -75,7 +75,9 @@ class ConditionalSampler:
             value = self._sample_layer(layer, factor, v, x)
             x = value if index == last else x + value
         if self._noise_std is not None:
-            x = x + self._noise_std * torch.randn(x.shape, generator=self._generator, dtype=x.dtype, device=x.device)
+            x = x + self._noise_std.unsqueeze(1) * torch.randn(
+                x.shape, generator=self._generator, dtype=x.dtype, device=x.device
+            )
         return self._coordinates.decode(observation, x).masked_fill(lost, math.nan)
 
     def _sample_layer(self, layer: Layer, factor: Tensor, v: Tensor, x: Tensor) -> Tensor:
@@ -85,7 +87,7 @@ class ConditionalSampler:
             mean, variance = conditional(layer, factor, v, x)
             return mean + variance.sqrt().unsqueeze(-1) * noise
         mean, covariance = joint_conditional(layer, factor, v, x)
-        return mean + cholesky(covariance, layer.variance) @ noise
+        return mean + cholesky(covariance, layer.variance[:, None, None]) @ noise
 
 
 def _draw_layer(
@@ -100,40 +102,42 @@ def _draw_layer(
     """Draw ``num_functions`` functions per particle from p(f | u), by Matheron's rule.
 
     f(x) = phi(x) . w + k(x, Z) alpha with alpha = L_z^-T (v - L_z^-1 (phi(Z) w + sqrt(jitter) e)), w, e ~ N(0, I)
-    (Wilson et al. 2020, eq. 13). The term e makes the law exact for the jittered K_zz. Frequencies, phases and phi(Z)
-    are shared, so all functions' alpha are one product of their normals (w, e) with K_zz^-1 (phi(Z), sqrt(jitter) I).
+    (Wilson et al. 2020, eq. 13). The term e makes the law exact for the jittered K_zz. Every particle has features of
+    its own, so that over the particles of one plan the law is right, and not only over plans; its functions share them,
+    so all their alpha are one product of their normals (w, e) with K_zz^-1 (phi(Z), sqrt(jitter) I).
     """
-    num_inducing, input_size = layer.inducing_inputs.shape
-    num_particles, _, outputs = whitened.shape
-    scaled = layer.inducing_inputs / layer.lengthscale
-    features = draw_features(layer.kernel, num_features, input_size, generator, dtype=scaled.dtype)
-    columns = num_functions * num_particles * outputs
+    num_particles, num_inducing, outputs = whitened.shape
+    lengthscale = layer.lengthscale.unsqueeze(-2)
+    scaled = layer.inducing_inputs / lengthscale
+    features = draw_features(layer.kernel, num_particles, num_features, scaled.shape[-1], generator, scaled.dtype)
+    columns = num_functions * outputs
     # Normals are drawn in single precision, which is six times faster and ample for random numbers.
-    shape = (num_features + num_inducing, columns)
+    shape = (num_particles, num_features + num_inducing, columns)
     normals = torch.randn(shape, generator=generator, dtype=torch.float32, device=scaled.device)
-    sigma = layer.variance.sqrt()
-    identity = torch.eye(num_inducing, dtype=torch.float32, device=scaled.device)
-    prior = sigma * torch.cat([features(scaled), (JITTER**0.5 * identity).to(scaled)], dim=1)
-    known = torch.linalg.solve_triangular(factor.mT, whitened.movedim(0, 1).flatten(1), upper=True)
-    if columns < len(normals):
+    variance = layer.variance[:, None, None]
+    sigma = variance.sqrt()
+    jitter = (JITTER**0.5 * torch.eye(num_inducing, dtype=torch.float32, device=scaled.device)).to(scaled)
+    prior = sigma * torch.cat([features(scaled), jitter.expand(num_particles, -1, -1)], dim=2)
+    known = torch.linalg.solve_triangular(factor.mT, whitened, upper=True)
+    if columns < num_features + num_inducing:
         response = torch.cholesky_solve(prior @ normals.to(scaled.dtype), factor)
     else:
         response = torch.cholesky_solve(prior, factor) @ normals.to(scaled.dtype)
-    alpha = known.unsqueeze(1) - response.unflatten(1, (num_functions, -1))
+    alpha = known.repeat(1, 1, num_functions) - response
 
-    def per_function(matrix: Float[Tensor, "n columns"]) -> Float[Tensor, "T P O n"]:
-        return matrix.to(dtype).mT.contiguous().unflatten(0, (num_functions, num_particles, outputs))
+    def per_function(matrix: Float[Tensor, "P n columns"]) -> Float[Tensor, "T P O n"]:
+        return matrix.to(dtype).mT.unflatten(1, (num_functions, outputs)).transpose(0, 1).contiguous()
 
     scale = layer.kernel.argument_scale
     return PathwiseLayer(
         layer.kernel,
         (1.0 / layer.lengthscale).to(dtype),
-        (-2.0 * scale * scaled.mT).to(dtype),
+        (-2.0 * scale * scaled.mT).to(dtype).contiguous(),
         (scale * scaled.square().sum(-1)).to(dtype),
-        (features.frequency.mT / (2 * math.pi)).to(dtype),
-        (features.phase / (2 * math.pi)).to(dtype),
-        per_function(layer.variance * alpha.flatten(1)),
-        per_function(sigma * (2.0 / num_features) ** 0.5 * normals[:num_features]),
+        (features.frequency.mT / (2 * math.pi)).to(dtype).contiguous(),
+        (features.phase / (2 * math.pi)).to(dtype).expand(num_particles, -1).contiguous(),
+        per_function(variance * alpha),
+        per_function(sigma * (2.0 / num_features) ** 0.5 * normals[:, :num_features]),
     )
 
 
@@ -196,12 +200,14 @@ class PathwiseSampler:
 
     @cached_property
     def _in_weights(self) -> list[tuple[Tensor, Tensor]]:
-        """Each layer's maps from (x, |x|^2, 1) to the kernel's argument "D+2 M" and to the features' phases "D+2 F"."""
+        """Each layer's maps from (x, |x|^2, 1) to the kernel's argument "P D+2 M" and to the features' phases "P D+2 F"."""
         weights = []
         for layer in self.layers:
             square = torch.full_like(layer.offsets, layer.kernel.argument_scale)
-            distance = torch.cat([layer.centres, torch.stack([square, layer.offsets])])
-            turns = torch.cat([layer.frequencies, torch.stack([torch.zeros_like(layer.phases), layer.phases])])
+            distance = torch.cat([layer.centres, torch.stack([square, layer.offsets], dim=1)], dim=1)
+            turns = torch.cat(
+                [layer.frequencies, torch.stack([torch.zeros_like(layer.phases), layer.phases], dim=1)], dim=1
+            )
             weights.append((distance, 2 * math.pi * turns))
         return weights
 
@@ -212,15 +218,14 @@ class PathwiseSampler:
         augmented, correlations, decay, waves = buffers
         size, group = x.shape[-1], correlations.shape[0]
         scaled = augmented[..., :size]
-        torch.mul(x, layer.inverse_lengthscale, out=scaled)
+        torch.mul(x, layer.inverse_lengthscale.unsqueeze(1), out=scaled)
         torch.linalg.vecdot(scaled, scaled, out=augmented[..., size])
         kernel_out, feature_out = layer.kernel_out[function].mT, layer.feature_out[function].mT
         out = x.new_empty(*x.shape[:2], kernel_out.shape[-1])
         for first in range(0, len(x), group):
             own = slice(first, first + group)
-            points = augmented[own].flatten(0, 1)
-            torch.mm(points, weights[0], out=correlations.view(len(points), -1))
-            torch.mm(points, weights[1], out=waves.view(len(points), -1))
+            torch.bmm(augmented[own], weights[0][own], out=correlations)
+            torch.bmm(augmented[own], weights[1][own], out=waves)
             layer.kernel.correlation_(correlations, decay)
             torch.bmm(waves.cos_(), feature_out[own], out=out[own])
             out[own].baddbmm_(correlations, kernel_out[own])
@@ -278,7 +283,7 @@ class _Buffers(NamedTuple):
         """Room for G particles at a time: one on a CPU, so that its values stay in the cache; all on a GPU."""
         num_particles, num_points, size = x.shape
         group = 1 if x.device.type == "cpu" else num_particles
-        num_inducing, num_features = layer.offsets.numel(), layer.phases.numel()
+        num_inducing, num_features = layer.offsets.shape[1], layer.phases.shape[1]
         return cls(
             x.new_ones(num_particles, num_points, size + 2),
             x.new_empty(group, num_points, num_inducing),

@@ -1,7 +1,7 @@
 """The paper's dynamics model: a deep Gaussian process over transitions, sampled by SG-HMC.
 
-Prepares data for `inference/`, keeps what it returns (hyperparameters, chain, pool of posterior samples), and makes
-the draws of `draws.py` from the pool. The agent calls `fit` at an episode's start, `resample` after each control step
+Prepares data for `inference/`, keeps what it returns (for each of some chains hyperparameters, where it is, and a pool
+of posterior samples), and makes the draws of `draws.py` from the pool: each particle is of another chain. The agent calls `fit` at an episode's start, `resample` after each control step
 and `draw` for each plan.
 """
 
@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gym_dgpmpc.checks import check_counts
@@ -38,20 +38,22 @@ from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all, propagate_means
 from gym_dgpmpc.gp.kernels import Kernel, find_kernel
 from gym_dgpmpc.gp.layer import Layer, parameter_shapes
-from gym_dgpmpc.inference import mcem, sghmc, training
+from gym_dgpmpc.inference import sghmc, training
 from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
-from gym_dgpmpc.inference.mcem import InferenceSettings
+from gym_dgpmpc.inference.sampler import Chains, ChainState, InferenceSettings, flatten, with_latents
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
 
 class _Fitted(NamedTuple):
     """What a fit leaves behind, and a `resample` moves on."""
 
-    factorised: Factorised  # a saved state holds only its model
+    factorised: Factorised  # of C chains; a saved state holds only its model
     normalisers: tuple[Normaliser, Normaliser]
-    chain: sghmc.SGHMCState
-    pool: Tensor  # "num_samples V", a ring
+    chain: sghmc.SGHMCState  # "C V"
+    latents: list[Tensor]  # "C N D" of each inner layer, float32
+    pool: Tensor  # "n C V", a ring of n samples of each chain
     oldest: int  # the row of the pool that the next sample replaces
+    turn: int  # the chain that goes on next within an episode
     step_size: float  # of SG-HMC: the setting, unless training had to take smaller steps
     noise: NoiseSplit | None = None  # None: not told apart
 
@@ -89,14 +91,17 @@ class DeepGPDynamics(Learner[_Fitted]):
             candidate sequences, as in the paper) or "marginal" (values, each candidate on its own).
         refresh: when a particle of a "pathwise" draw gets a new function: at each "step" of a plan, or once per "plan".
         num_features: random features of a "pathwise" draw, F; the error of its prior covariance falls as F^-1/2.
-        first_training_iterations: training iterations of the first fit, of one SG-HMC and one Adam step each.
+        first_training_iterations: training iterations of the first fit, of one SG-HMC step each; every few of them move
+            the hyperparameters.
         training_iterations: training iterations of each later fit, which goes on from the fit before.
-        num_samples: posterior samples kept (the pool); the worlds of a plan are drawn from them.
+        num_chains: chains of the sampler, C, with hyperparameters and inducing inputs of their own; particles are spread
+            over them.
+        num_samples: posterior samples kept (the pool), over all chains, and rounded up to as many of each; the worlds of
+            a plan are drawn from them.
         sample_spacing: SG-HMC steps between two samples of the pool; more of them make the samples less alike.
-        resample_steps: SG-HMC steps after each control step, by which the posterior follows the new data; 0 keeps the
-            posterior as it is within an episode.
-        resample_samples: samples of the pool that are replaced after each control step, at least 1, if the last layer
-            is drawn exactly.
+        resample_steps: SG-HMC steps of one chain after each control step, of the chains in turn, by which the posterior
+            follows the new data; 0 keeps the posterior as it is within an episode.
+        resample_samples: samples of that chain that are replaced then, at least 1, if the last layer is drawn exactly.
         relocate: move the inducing inputs to the cluster centres of the grown data before each later fit.
         add_noise: draw the fitted noise too, so that plans reckon with it: for plants or sensors that are noisy.
         split_noise: where ``add_noise`` is on, tell the sensors' noise, which only blurs what is observed, from the
@@ -136,6 +141,7 @@ class DeepGPDynamics(Learner[_Fitted]):
         num_features: int = 128,
         first_training_iterations: int = 4000,
         training_iterations: int = 1000,
+        num_chains: int = 5,
         num_samples: int = 100,
         sample_spacing: int = 10,
         resample_steps: int = 10,
@@ -154,6 +160,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             num_features=num_features,
             first_training_iterations=first_training_iterations,
             training_iterations=training_iterations,
+            num_chains=num_chains,
             num_samples=num_samples,
             sample_spacing=sample_spacing,
             resample_samples=resample_samples,
@@ -170,8 +177,10 @@ class DeepGPDynamics(Learner[_Fitted]):
         self.num_layers, self.num_inducing, self.num_features = num_layers, num_inducing, num_features
         self.draw_kind, self.refresh = draw, refresh
         self.first_training_iterations, self.training_iterations = first_training_iterations, training_iterations
-        self.num_samples, self.sample_spacing, self.resample_steps = num_samples, sample_spacing, resample_steps
-        self.relocate, self.resample_samples = relocate, min(resample_samples, num_samples)
+        self.num_chains, self.num_samples, self.sample_spacing = num_chains, num_samples, sample_spacing
+        self._samples_of_chain = -(-num_samples // num_chains)
+        self.relocate, self.resample_steps = relocate, resample_steps
+        self.resample_samples = min(resample_samples, self._samples_of_chain)
         self.inference = InferenceSettings(**inference)
         self.compile = compile and dtype == torch.float32 and self.device.type == "cpu"
 
@@ -186,48 +195,54 @@ class DeepGPDynamics(Learner[_Fitted]):
         """
         normalisers, standardised = self._standardised(data)
         if self._fitted is None:
-            iterations = self.first_training_iterations
-            model = initial_model(self.kernel, standardised, self.num_layers, self.num_inducing, generator)
-            whitened = standardised.x.new_zeros(model.num_whitened())
+            iterations, burn_in = self.first_training_iterations, training.BURN_IN
+            model = initial_model(
+                self.kernel, standardised, self.num_layers, self.num_inducing, self.num_chains, generator
+            )
+            whitened = standardised.x.new_zeros(self.num_chains, model.num_whitened())
         else:
-            iterations, last = self.training_iterations, self._fitted
+            iterations, burn_in, last = self.training_iterations, 0.0, self._fitted
             model, whitened = restandardise(last.factorised.model, last.chain.position, last.normalisers, normalisers)
             if self.relocate:
                 model, whitened = relocate(model, whitened, standardised, generator)
-        total, report = iterations + self.num_samples * self.sample_spacing, self.on_progress or _report_nothing
+        samples, spacing = self._samples_of_chain, self.sample_spacing
+        total, report = iterations + samples * spacing, self.on_progress or _report_nothing
         trained = training.train(
             model,
-            sghmc.init(whitened),
+            whitened,
             standardised,
             iterations,
             generator,
             self.inference,
-            lambda done, loss: report(done, total, loss),
+            burn_in=burn_in,
+            on_look=lambda done, loss: report(done, total, loss),
         )
-        factorised = factorise_all(trained.model)
         sampled = training.sample_pool(
-            factorised,
-            trained.chain,
+            trained.model,
+            trained.state,
             standardised,
-            self.num_samples,
-            self.sample_spacing,
+            samples,
+            spacing,
             generator,
             trained.settings,
-            lambda count: report(iterations + count * self.sample_spacing, total, trained.negative_log_joint),
+            lambda count: report(iterations + count * spacing, total, trained.negative_log_likelihood),
         )
-        variance = factorised.model.noise_variance
+        factorised = factorise_all(trained.model)
+        variance = factorised.model.noise_variance.mean(0)
         noise = self._split_noise(data, normalisers, _posterior_mean(factorised, sampled.pool), variance)
-        self._fitted = _Fitted(factorised, normalisers, sampled.chain, sampled.pool, 0, sampled.step_size, noise)
+        latents = [latent.float() for latent in sampled.state.latents]
+        chain, step_size = sampled.state.whitened, sampled.step_size
+        self._fitted = _Fitted(factorised, normalisers, chain, latents, sampled.pool, 0, 0, step_size, noise)
         counts = {"iterations": float(trained.num_iterations), "rollbacks": float(trained.num_rollbacks)}
-        metrics = {"negative_log_joint": trained.negative_log_joint} | counts | self._diagnostics(self._fitted)
-        return metrics | self._noise_metrics(noise, normalisers[1], variance)
+        metrics = {"negative_log_likelihood": trained.negative_log_likelihood} | counts
+        return metrics | self._diagnostics(self._fitted) | self._noise_metrics(noise, normalisers[1], variance)
 
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
-        """Follow the grown data: the newest samples take the places of the pool's oldest.
+        """Follow the grown data: one chain, of all in turn, goes on, and its newest samples replace its oldest.
 
         They are ``resample_samples`` exact draws of the last layer, after a few SG-HMC steps over all layers; without
         exact draws (``gibbs_every=0``) the position that those steps lead to. A chain that leaves what is plausible is
-        dropped, and the pool stays as it was.
+        put back, and its samples stay as they were.
 
         Returns:
             ``resamplings_dropped``: 1 if that happened, otherwise 0; an empty mapping if there are no steps to take.
@@ -239,47 +254,58 @@ class DeepGPDynamics(Learner[_Fitted]):
         if self.resample_steps == 0:
             return {}
         try:
-            chain, newest = self._newest_samples(fitted, data, generator)
+            moved, newest = self._go_on(fitted, data, generator)
         except FactorisationError:  # in an exact draw: the steps before it left values that are not finite
             return {"resamplings_dropped": 1.0}
         if not training.is_plausible(newest):
             return {"resamplings_dropped": 1.0}
-        rows = (fitted.oldest + torch.arange(len(newest), dtype=torch.int64, device=self.device)) % self.num_samples
-        fitted.pool[rows] = newest
-        self._fitted = fitted._replace(chain=chain, oldest=(fitted.oldest + len(newest)) % self.num_samples)
+        turn, count = fitted.turn, self._samples_of_chain
+        rows = (fitted.oldest + torch.arange(len(newest), dtype=torch.int64, device=self.device)) % count
+        fitted.pool[rows, turn] = newest
+        following = (turn + 1) % self.num_chains
+        oldest = fitted.oldest if following else (fitted.oldest + len(newest)) % count
+        self._fitted = moved._replace(turn=following, oldest=oldest)
         return {"resamplings_dropped": 0.0}
 
-    def _newest_samples(
+    def _go_on(
         self, fitted: _Fitted, data: Transitions, generator: torch.Generator
-    ) -> tuple[sghmc.SGHMCState, Float[Tensor, "n V"]]:
-        """The chain some steps on, and the samples for the pool, of which the last is where the chain then is."""
+    ) -> tuple[_Fitted, Float[Tensor, "n V"]]:
+        """The chain whose turn it is some steps on, and its newest samples, of which the last is where it then is."""
         standardised = _Standardised(self._encode, data, fitted.normalisers)
         settings = replace(self.inference, step_size=fitted.step_size)
-        without_gibbs = replace(settings, gibbs_every=0)
-        (chain,) = mcem.sample(
-            fitted.factorised, fitted.chain, standardised, 1, self.resample_steps, generator, without_gibbs
+        own = slice(fitted.turn, fitted.turn + 1)
+        model = fitted.factorised.model.at(torch.tensor([fitted.turn], dtype=torch.int64, device=self.device))
+        latents = with_latents(fitted.latents, standardised.num_rows, generator)
+        state = ChainState(
+            sghmc.SGHMCState(*(field[own] for field in fitted.chain)),
+            sghmc.init(flatten(model.parameters())),
+            [latent[own].to(model.log_noise) for latent in latents],
         )
-        if not settings.gibbs_every:
-            return chain, chain.position.unsqueeze(0)
-        newest = mcem.gibbs_positions(
-            fitted.factorised, chain, standardised, self.resample_samples, generator, settings
-        )
-        return chain._replace(position=newest[-1]), newest
+        chains = Chains(model, state, standardised, settings, 0)
+        for _ in range(self.resample_steps):
+            chains.step(generator, burn_in=False)
+        newest = chains.state.whitened.position
+        if settings.gibbs_every:
+            newest = chains.last_layer_draws(self.resample_samples, generator)[:, 0]
+        moved = chains.state.whitened._replace(position=newest[-1:])
+        chain = sghmc.SGHMCState(*(_put(whole, own, part) for whole, part in zip(fitted.chain, moved, strict=True)))
+        latents = [_put(whole, own, part.float()) for whole, part in zip(latents, chains.state.latents, strict=True)]
+        return fitted._replace(chain=chain, latents=latents), newest
 
     def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
-        """One sample of the pool per particle (distinct while the pool lasts), for plans of ``horizon`` steps.
+        """Worlds for plans of ``horizon`` steps: particles are spread over the chains, each a sample of its chain.
 
         Raises:
             RuntimeError: the model was not fitted.
         """
         fitted = self._require_fit("draw")
-        order = torch.randperm(self.num_samples, generator=generator, device=self.device)
-        picked = order.repeat(math.ceil(num_particles / self.num_samples))[:num_particles]
-        whitened = fitted.factorised.model.split(fitted.pool[picked])
-        posterior = Posterior(fitted.factorised, whitened)
+        chain, row = self._pick(num_particles, generator)
+        model = fitted.factorised.model.at(chain)
+        factorised = Factorised(model, [factor[chain] for factor in fitted.factorised.factors])
+        posterior = Posterior(factorised, model.split(fitted.pool[row, chain]))
         coordinates = Coordinates(self.encoder, *fitted.normalisers, self.dtype)
         drawn = self._drawn_noise(fitted.noise)
-        process_std = (fitted.factorised.model.noise_variance * drawn.process_share).sqrt() if self.add_noise else None
+        process_std = (model.noise_variance * drawn.process_share).sqrt() if self.add_noise else None
         blur = drawn.observation(self.encoder)
         if self.draw_kind == "pathwise":
             settings = posterior, coordinates, horizon, self.num_features, self.refresh
@@ -291,17 +317,33 @@ class DeepGPDynamics(Learner[_Fitted]):
         sampler = ConditionalSampler(posterior, coordinates, generator, joint=joint, noise_std=process_std)
         return observed(sampler, blur, generator)
 
+    def _pick(self, num_particles: int, generator: torch.Generator) -> tuple[Int[Tensor, "P"], Int[Tensor, "P"]]:
+        """A chain and a row of the pool for each particle, as different as may be."""
+
+        def spread_over(count: int, rounds: int) -> Int[Tensor, "P"]:
+            orders = [torch.randperm(count, generator=generator, device=self.device) for _ in range(rounds)]
+            return torch.cat(orders)
+
+        chains, samples = self.num_chains, self._samples_of_chain
+        rounds = math.ceil(num_particles / chains)
+        chain = spread_over(chains, rounds)[:num_particles]
+        # Every round over the chains has a row of its own for each of them, and they begin at rows of their own.
+        rows = torch.stack([spread_over(samples, math.ceil(rounds / samples))[:rounds] for _ in range(chains)], dim=1)
+        return chain, rows[torch.arange(num_particles, dtype=torch.int64, device=self.device) // chains, chain]
+
     def state_dict(self) -> StateDict:
         """Hyperparameters, normalisers, the chain and the whole pool of samples; empty before the first fit."""
         if self._fitted is None:
             return {}
         fitted, model = self._fitted, self._fitted.factorised.model
         # The pool is the one tensor that changes in place, which must not change a state taken before.
-        state: StateDict = {"pool": fitted.pool.clone(), "oldest": fitted.oldest, "log_noise": model.log_noise}
+        state: StateDict = {"pool": fitted.pool.clone(), "oldest": fitted.oldest, "turn": fitted.turn}
+        state["log_noise"] = model.log_noise
         if fitted.step_size != self.inference.step_size:  # older states do not have this entry
             state["step_size"] = fitted.step_size
         for index, layer in enumerate(model.layers):
             state |= {f"layers.{index}.{name}": value for name, value in layer.parameters().items()}
+        state |= {f"latents.{index}": latent for index, latent in enumerate(fitted.latents)}
         state |= normalisers_state(*fitted.normalisers) | ({} if fitted.noise is None else fitted.noise.state())
         return state | {f"chain.{name}": value for name, value in fitted.chain._asdict().items()}
 
@@ -317,51 +359,71 @@ class DeepGPDynamics(Learner[_Fitted]):
         size, num_targets, device = self.encoder.input_size, self.encoder.target_size, self.device
         whitened = self.num_inducing * (size * (self.num_layers - 1) + num_targets)
 
+        chains, count = self.num_chains, self._samples_of_chain
+
         def take(name: str, *shape: int) -> Tensor:
             return take_tensor(state, name, shape, device)
 
+        def take_index(name: str, below: int) -> int:
+            value = state.get(name)
+            if not isinstance(value, int) or not 0 <= value < below:
+                raise ValueError(f"dynamics state {name!r}: expected one of 0 to {below - 1}, received {value!r}")
+            return value
+
         shapes = parameter_shapes(self.num_inducing, size)
+        shapes = {name: (chains, *shape) for name, shape in shapes.items()}
         layers = (
             Layer(self.kernel, **take_tensors(state, shapes, device, prefix=f"layers.{i}."))
             for i in range(self.num_layers)
         )
-        model = DeepGP(tuple(layers), take("log_noise", num_targets))
+        model = DeepGP(tuple(layers), take("log_noise", chains, num_targets))
         normalisers = (
             take_normaliser(state, "inputs", size, device),
             take_normaliser(state, "targets", num_targets, device),
         )
-        chain = sghmc.SGHMCState(*(take(f"chain.{name}", whitened) for name in sghmc.SGHMCState._fields))
-        pool, oldest = take("pool", self.num_samples, whitened), state.get("oldest")
-        if not isinstance(oldest, int) or not 0 <= oldest < self.num_samples:
-            raise ValueError(
-                f"dynamics state 'oldest': expected a row of the pool, 0 to {self.num_samples - 1}, received {oldest!r}"
-            )
+        chain = sghmc.SGHMCState(*(take(f"chain.{name}", chains, whitened) for name in sghmc.SGHMCState._fields))
+        pool = take("pool", count, chains, whitened)
+        oldest, turn = take_index("oldest", count), take_index("turn", chains)
+        latents = [self._take_latent(state, f"latents.{i}") for i in range(self.num_layers - 1)]
         step_size = state.get("step_size", self.inference.step_size)
         if not isinstance(step_size, float) or not 0.0 < step_size < math.inf:
             raise ValueError(f"dynamics state 'step_size': expected a positive number, received {step_size!r}")
         noise = take_noise_split(state, num_targets, device)
-        self._fitted = _Fitted(factorise_all(model), normalisers, chain, pool, oldest, step_size, noise)
+        self._fitted = _Fitted(factorise_all(model), normalisers, chain, latents, pool, oldest, turn, step_size, noise)
+
+    def _take_latent(self, state: StateDict, name: str) -> Float[Tensor, "C N D"]:
+        """The latents of an inner layer, for however many rows there were."""
+        value = state.get(name)
+        rows = value.shape[1] if isinstance(value, Tensor) and value.ndim == 3 else 0
+        return take_tensor(state, name, (self.num_chains, rows, self.encoder.input_size), self.device, torch.float32)
 
     def _diagnostics(self, fitted: _Fitted) -> dict[str, float]:
         """Mixing of the kept samples (medians over coordinates), and the fitted noise and kernel scales."""
         model = fitted.factorised.model
+        by_chain = fitted.pool.unbind(1)
+        sizes = torch.stack([effective_sample_size(samples) for samples in by_chain])
         metrics = {
-            "effective_sample_size": float(effective_sample_size(fitted.pool).median()),
-            "gradient_norm": float(fitted.chain.gradient.norm()),
+            "effective_sample_size": float(sizes.sum(0).median()),
+            "gradient_norm": float(fitted.chain.gradient.norm(dim=-1).mean()),
             "noise_std": float(model.noise_variance.sqrt().mean()),
         }
-        if self.num_samples >= 4:
-            metrics["r_hat"] = float(split_r_hat(fitted.pool).median())
+        if self._samples_of_chain >= 4:
+            metrics["r_hat"] = float(torch.stack([split_r_hat(samples) for samples in by_chain]).median())
         for index, layer in enumerate(model.layers):
-            metrics[f"layer_{index + 1}_kernel_std"] = float(layer.variance.sqrt())
+            metrics[f"layer_{index + 1}_kernel_std"] = float(layer.variance.sqrt().mean())
         return metrics
 
 
-def _posterior_mean(factorised: Factorised, pool: Float[Tensor, "num_samples V"]) -> Callable[[Tensor], Tensor]:
-    """The mean of the standardised targets over ten samples of the pool, which is ample for residuals."""
-    some = pool[:: -(-len(pool) // 10)]
+def _put(whole: Tensor, where: slice, part: Tensor) -> Tensor:
+    """A copy of the whole with another part in this place of its first axis."""
+    return torch.cat([whole[: where.start], part, whole[where.stop :]])
+
+
+def _posterior_mean(factorised: Factorised, pool: Float[Tensor, "n C V"]) -> Callable[[Tensor], Tensor]:
+    """The mean of the standardised targets over a few samples of each chain, which is ample for residuals."""
+    some = pool[:: -(-len(pool) // 2)]
     whitened = factorised.model.split(some)
-    return lambda x: propagate_means(factorised, whitened, x.expand(len(some), -1, -1)).mean(0)
+    return lambda x: propagate_means(factorised, whitened, x.expand(*some.shape[:2], -1, -1)).mean((0, 1))
 
 
 def _report_nothing(done: int, total: int, loss: float) -> None:

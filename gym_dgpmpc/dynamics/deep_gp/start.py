@@ -17,29 +17,31 @@ from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.gp.deep_gp import DeepGP
 from gym_dgpmpc.gp.kernels import Kernel
 from gym_dgpmpc.gp.layer import Layer, conditional, factorise
+from gym_dgpmpc.inference import priors
 
 MOST_CLUSTERED = 10_000
 """The most rows to cluster: of more than this a random subset is taken, so that the cost stays the same."""
 
-INNER_VARIANCE = 0.01
-NOISE_VARIANCE = 0.05
 
+def initial_model(
+    kernel: Kernel, data: Data, num_layers: int, num_inducing: int, num_chains: int, generator: torch.Generator
+) -> DeepGP:
+    """Hyperparameters of C chains before the first fit, for standardised data.
 
-def initial_model(kernel: Kernel, data: Data, num_layers: int, num_inducing: int, generator: torch.Generator) -> DeepGP:
-    """Hyperparameters before the first fit, for standardised data.
-
-    Inducing inputs by k-means of the inputs, in every layer (the inner layers start near the identity); lengthscales
-    sqrt(D); kernel variance 0.01 in the inner layers and 1 in the last; noise variance 0.05 times a target's.
+    Inducing inputs by k-means of the inputs, of each chain its own, in every layer (the inner layers start near the
+    identity); all else at the centres of `inference.priors`.
     """
     size = data.x.shape[1]
-    centres = cluster(_rows_to_cluster(data.x, generator), num_inducing, generator)
-    log_lengthscale = data.x.new_full((size,), 0.5 * math.log(size))
+    rows = _rows_to_cluster(data.x, generator)
+    centres = torch.stack([cluster(rows, num_inducing, generator) for _ in range(num_chains)])
+    log_lengthscale = data.x.new_full((num_chains, size), priors.log_lengthscale_centre(size))
 
-    def layer(variance: float) -> Layer:
-        return Layer(kernel, centres.clone(), log_lengthscale.clone(), data.x.new_tensor(math.log(variance)))
+    def layer(*, last: bool) -> Layer:
+        log_variance = data.x.new_full((num_chains,), priors.log_variance_centre(last=last))
+        return Layer(kernel, centres.clone(), log_lengthscale.clone(), log_variance)
 
-    layers = tuple(layer(INNER_VARIANCE) for _ in range(num_layers - 1))
-    return DeepGP((*layers, layer(1.0)), data.y.new_full((data.y.shape[1],), math.log(NOISE_VARIANCE)))
+    layers = tuple(layer(last=index == num_layers - 1) for index in range(num_layers))
+    return DeepGP(layers, data.y.new_full((num_chains, data.y.shape[1]), math.log(priors.NOISE_VARIANCE)))
 
 
 def cluster(x: Float[Tensor, "N D"], num_clusters: int, generator: torch.Generator) -> Float[Tensor, "M D"]:
@@ -67,10 +69,10 @@ def _rows_to_cluster(x: Float[Tensor, "N D"], generator: torch.Generator) -> Flo
 
 def restandardise(
     model: DeepGP,
-    whitened: Float[Tensor, "V"],
+    whitened: Float[Tensor, "*c V"],
     old: tuple[Normaliser, Normaliser],
     new: tuple[Normaliser, Normaliser],
-) -> tuple[DeepGP, Float[Tensor, "V"]]:
+) -> tuple[DeepGP, Float[Tensor, "*c V"]]:
     """The same function of raw inputs, expressed in new standardised coordinates of inputs and targets.
 
     Inner layers live in the inputs' coordinates, so their inducing inputs and lengthscales follow the inputs' affine
@@ -93,26 +95,28 @@ def restandardise(
     scaled = [v * stretch for v in inner] + [last * (stretch_out / common.exp())]
     return (
         DeepGP(tuple(layers), model.log_noise + 2 * stretch_out.log()),
-        torch.cat([v.flatten() for v in scaled]),
+        torch.cat([v.flatten(-2) for v in scaled], dim=-1),
     )
 
 
 def relocate(
-    model: DeepGP, whitened: Float[Tensor, "V"], data: Data, generator: torch.Generator
-) -> tuple[DeepGP, Float[Tensor, "V"]]:
+    model: DeepGP, whitened: Float[Tensor, "C V"], data: Data, generator: torch.Generator
+) -> tuple[DeepGP, Float[Tensor, "C V"]]:
     """Move every layer's inducing inputs to where its inputs are now, keeping the function they encode.
 
     New centres come from k-means of the inputs propagated by the layers' means; the new inducing outputs are the old
     conditional mean there.
     """
-    layers, outputs, x = [], [], _rows_to_cluster(data.x, generator)
+    rows = _rows_to_cluster(data.x, generator)
+    layers, outputs, x = [], [], rows.expand(len(whitened), -1, -1)
     last = len(model.layers) - 1
     for index, (layer, v) in enumerate(zip(model.layers, model.split(whitened), strict=True)):
         factor = factorise(layer)
-        moved = layer._replace(inducing_inputs=cluster(x, layer.inducing_inputs.shape[0], generator))
-        mean, _ = conditional(layer, factor, v, moved.inducing_inputs)
+        centres = torch.stack([cluster(each, layer.inducing_inputs.shape[-2], generator) for each in x])
+        moved = layer._replace(inducing_inputs=centres)
+        mean, _ = conditional(layer, factor, v, centres)
         outputs.append(torch.linalg.solve_triangular(factorise(moved), mean, upper=False))
         layers.append(moved)
         if index != last:
             x = x + conditional(layer, factor, v, x)[0]
-    return DeepGP(tuple(layers), model.log_noise), torch.cat([v.flatten() for v in outputs])
+    return DeepGP(tuple(layers), model.log_noise), torch.cat([v.flatten(-2) for v in outputs], dim=-1)

@@ -16,7 +16,7 @@ from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.dynamics.coordinates import Coordinates
-from gym_dgpmpc.dynamics.deep_gp.start import NOISE_VARIANCE, restandardise
+from gym_dgpmpc.dynamics.deep_gp.start import restandardise
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.noise import NoiseSplit, observed, take_noise_split
@@ -28,6 +28,7 @@ from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.gp.moments import Predictor
 from gym_dgpmpc.gp.sgpr import SparsePosterior, shrinkage, sparse_posterior, sparse_predict
 from gym_dgpmpc.inference.lbfgs import maximise_bound
+from gym_dgpmpc.inference.priors import NOISE_VARIANCE
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
 GPDraw = Literal["DS", "MM", "AMM"]

@@ -41,11 +41,11 @@ struct Layer {
   int64_t kernel;             // see `kernel_number`
   float argument_scale;       // c
   int64_t outputs;            // O
-  const float *inverse_lengthscale;  // [D]
-  const float *centres;       // [M / UNITS, D, UNITS], M padded with zeros to a multiple of UNITS
-  const float *offsets;       // [M]
-  const float *frequencies;   // [F / UNITS, D, UNITS], in turns
-  const float *phases;        // [F], in turns
+  const float *inverse_lengthscale;  // [P, D]
+  const float *centres;       // [P, M / UNITS, D, UNITS], M padded with zeros to a multiple of UNITS
+  const float *offsets;       // [P, M]
+  const float *frequencies;   // [P, F / UNITS, D, UNITS], in turns
+  const float *phases;        // [P, F], in turns
   const float *kernel_out;    // [T, P, O, M]
   const float *feature_out;   // [T, P, O, F]
 };
@@ -321,6 +321,16 @@ void store(const vec *state, int64_t size, int64_t count, float *rows) {
     for (int64_t s = 0; s < size; s++) rows[i * size + s] = lanes[s * POINTS + i];
 }
 
+// The layer as one particle has it.
+inline Layer of_particle(const Task &task, Layer layer, int64_t particle) {
+  layer.inverse_lengthscale += particle * task.input_size;
+  layer.centres += particle * task.num_inducing * task.input_size;
+  layer.offsets += particle * task.num_inducing;
+  layer.frequencies += particle * task.num_features * task.input_size;
+  layer.phases += particle * task.num_features;
+  return layer;
+}
+
 void run(const Task &task, int64_t particle, int64_t first, int64_t last, vec *scratch) {
   const int64_t size = task.observation_size, inputs = task.input_size;
   const int64_t blocks = (last - first + POINTS - 1) / POINTS;
@@ -349,7 +359,7 @@ void run(const Task &task, int64_t particle, int64_t first, int64_t last, vec *s
       const int64_t function = (task.num_functions == 1 ? 0 : step) * task.num_particles + particle;
       encode(task, state, task.actions + (point * task.horizon + step) * task.action_size, count, input);
       for (int64_t l = 0; l < task.num_layers; l++) {
-        const Layer &layer = task.layers[l];
+        const Layer layer = of_particle(task, task.layers[l], particle);
         for (int64_t d = 0; d < inputs; d++)
           for (int v = 0; v < VECTORS; v++)
             scaled[d * VECTORS + v] = input[d * VECTORS + v] * layer.inverse_lengthscale[d];
