@@ -73,6 +73,10 @@ class DeepGP(NamedTuple):
         """The models of these chains, the same one more than once if need be."""
         return self.with_parameters([tensor[chain] for tensor in self.parameters()])
 
+    def at_all(self, num_chains: int) -> "DeepGP":
+        """The same model for each of C chains."""
+        return self.with_parameters([tensor.expand(num_chains, *tensor.shape) for tensor in self.parameters()])
+
     def detach(self) -> "DeepGP":
         return self.with_parameters([tensor.detach() for tensor in self.parameters()])
 

@@ -138,13 +138,12 @@ def with_flat(model: DeepGP, flat: Float[Tensor, "C H"]) -> DeepGP:
     return model.with_parameters([part.view(shape) for part, shape in zip(parts, shapes, strict=True)])
 
 
-def initial_state(
-    model: DeepGP, whitened: Float[Tensor, "C V"], num_data: int, generator: torch.Generator
-) -> ChainState:
-    """Chains at rest, their latents drawn from the prior."""
-    none = [whitened.new_empty(len(whitened), 0, layer.inducing_inputs.shape[-1]) for layer in model.layers[:-1]]
+def initial_state(model: DeepGP, whitened: SGHMCState, num_data: int, generator: torch.Generator) -> ChainState:
+    """Chains that begin with these hyperparameters and inducing outputs, their latents drawn from the prior."""
+    start = whitened.position
+    none = [start.new_empty(len(start), 0, layer.inducing_inputs.shape[-1]) for layer in model.layers[:-1]]
     parameters = sghmc.init(flatten(model.parameters()))
-    return ChainState(sghmc.init(whitened), parameters, with_latents(none, num_data, generator))
+    return ChainState(whitened, parameters, with_latents(none, num_data, generator))
 
 
 def with_latents(
@@ -167,7 +166,9 @@ class Chains:
         state: where to start; preconditioners are kept.
         data: what is conditioned on.
         settings: of the sampler.
-        num_burn_in: iterations in which Adam moves the hyperparameters; of "sampled" ones, SG-HMC does after them.
+        num_burn_in: iterations in which preconditioners adapt, and Adam moves the hyperparameters. After them
+            preconditioners stay, since one that follows the chain makes it wander too far, and "sampled"
+            hyperparameters are moved by SG-HMC, "optimised" ones by Adam as before.
     """
 
     def __init__(
@@ -200,17 +201,17 @@ class Chains:
         passed, _ = self._pass(self.state.whitened.position, batch, index, generator, move=False)
         return -float(likelihood(self.factorised, passed, batch.y).mean())
 
-    def step(self, generator: torch.Generator, *, burn_in: bool = True) -> None:
+    def step(self, generator: torch.Generator, *, frozen: bool = False) -> None:
         """One SG-HMC step of the inducing outputs; now and then one of the hyperparameters, and one exact draw.
 
         Args:
-            burn_in: adapt the preconditioners, and move the hyperparameters.
+            frozen: leave the hyperparameters, and the exact draws, out.
 
         Raises:
             FactorisationError: with the present hyperparameters a K_zz cannot be factorised.
         """
         settings, num_data, state = self.settings, self.data.num_rows, self.state
-        moves_parameters = burn_in and (self.iteration + 1) % settings.hyperparameters_every == 0
+        moves_parameters = not frozen and (self.iteration + 1) % settings.hyperparameters_every == 0
         batch, index = self._batch(settings.batch_size, generator)
         passed, latents = self._pass(state.whitened.position, batch, index, generator, move=self.iteration % 2 == 0)
         self.value = -likelihood(self.factorised, passed, batch.y).mean(-1)
@@ -222,10 +223,10 @@ class Chains:
             generator,
             step_size=settings.step_size,
             decay=settings.decay,
-            burn_in=burn_in,
+            burn_in=self.iteration < self._num_burn_in,
         )
         self.state = self.state._replace(whitened=whitened)
-        if burn_in and settings.gibbs_every and self.iteration % settings.gibbs_every == 0:
+        if not frozen and settings.gibbs_every and self.iteration % settings.gibbs_every == 0:
             self.draw_last_layer(generator)
         self._window[self.iteration % settings.window_size] = self.state.whitened.position
         self.iteration += 1
@@ -326,10 +327,11 @@ class Chains:
                 generator,
                 step_size=settings.hyperparameter_step_size,
                 decay=settings.decay,
-                burn_in=True,
+                burn_in=False,
             )
         else:
-            parameters = sghmc.adapt(parameters, gradient)
+            if self.iteration <= self._num_burn_in:
+                parameters = sghmc.adapt(parameters, gradient)
             done = self.iteration / max(self._num_burn_in, 1)
             self._optimiser.param_groups[0]["lr"] = settings.learning_rate * LAST_LEARNING_RATE ** min(done, 1.0)
             self._flat.copy_(parameters.position)
@@ -412,7 +414,7 @@ def sample(
     """Go on with frozen hyperparameters and preconditioners; yield the positions every ``spacing`` steps."""
     for _ in range(num_samples):
         for _ in range(spacing):
-            chains.step(generator, burn_in=False)
+            chains.step(generator, frozen=True)
         if chains.settings.gibbs_every:
             chains.draw_last_layer(generator)
         yield chains.state.whitened.position

@@ -19,24 +19,24 @@ _TINY = 1e-16
 class SGHMCState(NamedTuple):
     """Position, momentum and the running statistics of the gradient that the preconditioner is made of."""
 
-    position: Float[Tensor, "V"]
-    momentum: Float[Tensor, "V"]
-    averaging: Float[Tensor, "V"]  # xi: the length of the averaging window, per coordinate
-    gradient: Float[Tensor, "V"]  # g: running mean of the gradient
-    square: Float[Tensor, "V"]  # g^2: running mean of its square
+    position: Float[Tensor, "*c V"]
+    momentum: Float[Tensor, "*c V"]
+    averaging: Float[Tensor, "*c V"]  # xi: the length of the averaging window, per coordinate
+    gradient: Float[Tensor, "*c V"]  # g: running mean of the gradient
+    square: Float[Tensor, "*c V"]  # g^2: running mean of its square
 
-    def inverse_mass(self) -> Float[Tensor, "V"]:
+    def inverse_mass(self) -> Float[Tensor, "*c V"]:
         """M^-1 = 1 / sqrt(g^2)."""
         return 1.0 / ((self.square + _TINY).sqrt() + _TINY)
 
 
-def init(position: Float[Tensor, "V"]) -> SGHMCState:
+def init(position: Float[Tensor, "*c V"]) -> SGHMCState:
     """A chain at rest, with unit preconditioner."""
     one = torch.ones_like(position)
     return SGHMCState(position, torch.zeros_like(position), one, one, one)
 
 
-def adapt(state: SGHMCState, gradient: Float[Tensor, "V"]) -> SGHMCState:
+def adapt(state: SGHMCState, gradient: Float[Tensor, "*c V"]) -> SGHMCState:
     """Update the running statistics: part of every burn-in step, left out while samples are kept."""
     rate = 1.0 / (state.averaging + 1.0)
     return state._replace(
@@ -48,7 +48,7 @@ def adapt(state: SGHMCState, gradient: Float[Tensor, "V"]) -> SGHMCState:
 
 def step(
     state: SGHMCState,
-    gradient: Float[Tensor, "V"],
+    gradient: Float[Tensor, "*c V"],
     num_data: int,
     generator: torch.Generator,
     *,

@@ -19,6 +19,7 @@ from gym_dgpmpc.errors import FactorisationError, TrainingError
 from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, log_likelihood, propagate
 from gym_dgpmpc.inference import sampler
 from gym_dgpmpc.inference.sampler import Chains, ChainState, InferenceSettings
+from gym_dgpmpc.inference.sghmc import SGHMCState
 
 MAX_ROLLBACKS = 5
 """The most rollbacks in one training; after the last of them the step sizes are 1/32 of the settings."""
@@ -35,8 +36,8 @@ HELD_OUT = 0.1, 256
 MIN_HELD_OUT = 10
 """With fewer rows their likelihood is too noisy to stop on, and nothing is held out."""
 
-BURN_IN = 0.5
-"""The share of a first training in which hyperparameters that are to be sampled are optimised."""
+BURN_IN, LATER_BURN_IN = 0.5, 0.25
+"""The share of a first and of a later training that serves to get to where the posterior is."""
 
 
 class Trained(NamedTuple):
@@ -64,7 +65,7 @@ class Sampled(NamedTuple):
 
 def train(
     model: DeepGP,
-    whitened: Float[Tensor, "C V"],
+    whitened: SGHMCState,
     data: Data,
     num_iterations: int,
     generator: torch.Generator,
@@ -77,9 +78,10 @@ def train(
 
     Args:
         model: hyperparameters to start from; left as they are.
-        whitened: inducing outputs to start from.
+        whitened: inducing outputs to start from, and their preconditioner.
         data: standardised; with early stopping a tenth of it serves to see when to stop.
-        burn_in: the share of the iterations in which hyperparameters that are to be sampled are optimised.
+        burn_in: the share of the iterations in which preconditioners adapt, and hyperparameters that are to be sampled
+            are optimised.
         on_look: is told the iterations done and the negative log likelihood, at the start and at every look.
 
     Raises:
@@ -89,8 +91,7 @@ def train(
     if settings.patience is not None:
         data, held_out = _split_off_held_out(data, generator)
     state = sampler.initial_state(model, whitened, data.num_rows, generator)
-    sampled = settings.hyperparameters == "sampled"
-    run = Chains(model, state, data, settings, round(burn_in * num_iterations) if sampled else num_iterations)
+    run = Chains(model, state, data, settings, round(burn_in * num_iterations))
     good, best, rollbacks = run.snapshot(), run.evaluate(_copy_of(generator)), 0
     best_likelihood, looks_since = -math.inf, 0
     if on_look is not None:

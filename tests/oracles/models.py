@@ -41,3 +41,9 @@ def make_model(
 
 def dense(layer: Layer) -> DenseLayer:
     return DenseLayer(layer.inducing_inputs.numpy(), layer.lengthscale.numpy(), float(layer.variance))
+
+
+def chains(*models: DeepGP) -> DeepGP:
+    """The models side by side, as those of as many chains."""
+    stacked = [torch.stack(tensors) for tensors in zip(*(model.parameters() for model in models), strict=True)]
+    return models[0].with_parameters(stacked)

@@ -199,12 +199,13 @@ class DeepGPDynamics(Learner[_Fitted]):
             model = initial_model(
                 self.kernel, standardised, self.num_layers, self.num_inducing, self.num_chains, generator
             )
-            whitened = standardised.x.new_zeros(self.num_chains, model.num_whitened())
+            whitened = sghmc.init(standardised.x.new_zeros(self.num_chains, model.num_whitened()))
         else:
-            iterations, burn_in, last = self.training_iterations, 0.0, self._fitted
-            model, whitened = restandardise(last.factorised.model, last.chain.position, last.normalisers, normalisers)
+            iterations, burn_in, last = self.training_iterations, training.LATER_BURN_IN, self._fitted
+            model, position = restandardise(last.factorised.model, last.chain.position, last.normalisers, normalisers)
             if self.relocate:
-                model, whitened = relocate(model, whitened, standardised, generator)
+                model, position = relocate(model, position, standardised, generator)
+            whitened = last.chain._replace(position=position, momentum=torch.zeros_like(position))
         samples, spacing = self._samples_of_chain, self.sample_spacing
         total, report = iterations + samples * spacing, self.on_progress or _report_nothing
         trained = training.train(
@@ -283,7 +284,7 @@ class DeepGPDynamics(Learner[_Fitted]):
         )
         chains = Chains(model, state, standardised, settings, 0)
         for _ in range(self.resample_steps):
-            chains.step(generator, burn_in=False)
+            chains.step(generator, frozen=True)
         newest = chains.state.whitened.position
         if settings.gibbs_every:
             newest = chains.last_layer_draws(self.resample_samples, generator)[:, 0]
