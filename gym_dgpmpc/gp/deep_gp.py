@@ -6,7 +6,7 @@ inducing outputs and fits the hyperparameters of what is defined here; `dynamics
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -129,6 +129,13 @@ def propagate_means(
         mean, _ = conditional(layer, factor, v, x)
         x = mean if index == last else x + mean
     return x
+
+
+def posterior_mean(factorised: Factorised, samples: Float[Tensor, "n V"]) -> Callable[[Tensor], Tensor]:
+    """From inputs "n D" to the mean of their targets "n T" over some ten of the samples: ample for residuals."""
+    some = samples[:: -(-len(samples) // 10)]
+    whitened = factorised.model.split(some)
+    return lambda x: propagate_means(factorised, whitened, x.expand(len(some), -1, -1)).mean(0)
 
 
 def log_likelihood(

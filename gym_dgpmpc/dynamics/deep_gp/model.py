@@ -35,7 +35,7 @@ from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.noise import NoiseSplit, observed, take_noise_split
 from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.errors import FactorisationError
-from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all, propagate_means
+from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all, posterior_mean
 from gym_dgpmpc.gp.kernels import Kernel, find_kernel
 from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.inference import mcem, sghmc, training
@@ -216,7 +216,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             lambda count: report(iterations + count * self.sample_spacing, total, trained.negative_log_joint),
         )
         variance = factorised.model.noise_variance
-        noise = self._split_noise(data, normalisers, _posterior_mean(factorised, sampled.pool), variance)
+        noise = self._split_noise(data, normalisers, posterior_mean(factorised, sampled.pool), variance)
         self._fitted = _Fitted(factorised, normalisers, sampled.chain, sampled.pool, 0, sampled.step_size, noise)
         counts = {"iterations": float(trained.num_iterations), "rollbacks": float(trained.num_rollbacks)}
         metrics = {"negative_log_joint": trained.negative_log_joint} | counts | self._diagnostics(self._fitted)
@@ -355,13 +355,6 @@ class DeepGPDynamics(Learner[_Fitted]):
         for index, layer in enumerate(model.layers):
             metrics[f"layer_{index + 1}_kernel_std"] = float(layer.variance.sqrt())
         return metrics
-
-
-def _posterior_mean(factorised: Factorised, pool: Float[Tensor, "num_samples V"]) -> Callable[[Tensor], Tensor]:
-    """The mean of the standardised targets over ten samples of the pool, which is ample for residuals."""
-    some = pool[:: -(-len(pool) // 10)]
-    whitened = factorised.model.split(some)
-    return lambda x: propagate_means(factorised, whitened, x.expand(len(some), -1, -1)).mean(0)
 
 
 def _report_nothing(done: int, total: int, loss: float) -> None:
