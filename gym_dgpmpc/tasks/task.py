@@ -20,7 +20,15 @@ from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import UnknownRewardError
 from gym_dgpmpc.tasks.environment import about_environment, describe, flat_size
 from gym_dgpmpc.tasks.first_batch import REWARD_SIGNATURE, example_batch
-from gym_dgpmpc.tasks.functions import LEARNED, Learned, Never, TaskFunctions, find_functions, find_observation_spec
+from gym_dgpmpc.tasks.functions import (
+    LEARNED,
+    NEVER,
+    Learned,
+    Never,
+    TaskFunctions,
+    find_functions,
+    find_observation_spec,
+)
 from gym_dgpmpc.tasks.modelled import ModelledVector
 from gym_dgpmpc.tasks.precision import hidden_changes, in_double, warn_of_hidden_changes
 from gym_dgpmpc.types import ObservationSpec, RewardFn, StateDict, TerminatedFn, Transitions
@@ -206,6 +214,12 @@ class Task:
         given = {"reward_fn": self._given.reward_fn, "terminated_fn": self._given.terminated_fn}
         return {name: isinstance(value, str) and value == LEARNED for name, value in given.items()}
 
+    @property
+    def _said_never(self) -> bool:
+        """Whether the user said that episodes never terminate."""
+        given = self._given.terminated_fn
+        return isinstance(given, str) and given == NEVER
+
     def describe(self) -> str:
         """Where reward and termination come from, on one line, for a person."""
         return self.functions.describe(can_learn_termination=self.learns_termination)
@@ -234,6 +248,7 @@ class Task:
             "reward": self.modelled.reward,
             "terminated": self.modelled.terminated,
             "to_learn": self.to_learn,
+            "never_terminates": self._said_never,
             "is_exact": self.is_exact,
             "has_terminated_fn": has_terminated_fn or self.lacks_terminated_fn,
             "about_environment": self.about_environment(),

@@ -6,7 +6,7 @@ import pytest
 import torch
 from gymnasium import spaces, wrappers
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecCheckNan, VecEnvWrapper, VecMonitor
 
 from gym_dgpmpc import DGPMPCAgent, MPCAgent
 from gym_dgpmpc.envs.performed_actions import RewardOfPerformed
@@ -330,6 +330,45 @@ def test_whole_numbers_are_refused_with_what_makes_floats_of_them():
     with pytest.raises(ValueError, match=r"int64.*DtypeObservation\(env, numpy\.float32\)"):
         agent(env)
     agent(wrappers.DtypeObservation(env, np.float32))
+
+
+UNSUPPORTED = {
+    "Text": (spaces.Text(5), r"got Text\("),
+    "Tuple": (spaces.Tuple([WIDE]), r"got Tuple\(Box"),
+    "no number": (spaces.Box(-1, 1, (0,)), r"one at least, .*got Box\(\[\]"),
+    "no part": (spaces.Dict(), r"at least one part, got Dict\(\)"),
+    "nested": (spaces.Dict(a=WIDE, b=spaces.Dict(c=WIDE)), r"got Dict\('c': .* for 'b'.*FlattenObservation"),
+}
+
+
+@pytest.mark.parametrize(("space", "named"), UNSUPPORTED.values(), ids=UNSUPPORTED)
+def test_observations_that_are_no_vectors_are_refused_before_anything_fails_at_them(space, named):
+    env = KnownPointMass()
+    env.observation_space = space
+    with pytest.raises(ValueError, match=named):
+        agent(env)
+
+
+@pytest.mark.parametrize(("bound", "dtype"), [(1e300, np.float64), (3e38, np.float32)])
+def test_bounds_that_float32_cannot_hold_are_refused(bound, dtype):
+    env = KnownPointMass()
+    env.action_space = spaces.Box(-bound, bound, (1,), dtype)
+    with pytest.raises(ValueError, match=r"float32 can hold, got low = \[-[13]\.?e\+.*RescaleAction"):
+        agent(env)
+
+
+@pytest.mark.parametrize("wrap", [lambda env: VecCheckNan(env, raise_exception=True), VecMonitor])
+def test_vec_wrappers_that_only_look_let_an_offered_reward_through(wrap):
+    assert sources(wrap(DummyVecEnv([KnownPointMass]))) == ("the environment's", "learned")
+
+
+def test_never_as_an_argument_is_kept_in_a_file(tmp_path):
+    given = {"reward_fn": "learned", "terminated_fn": "never"}
+    DGPMPCAgent(Offering(terminated_fn=None), **TINY, **given).save(tmp_path / "agent.zip")
+    env = Offering(terminated_fn=lambda state: state[..., 0] > 0)
+    assert DGPMPCAgent.load(tmp_path / "agent.zip", env).task.functions.terminated_source == "never"
+    loaded = DGPMPCAgent.load(tmp_path / "agent.zip", env, terminated_fn=None)
+    assert loaded.task.functions.terminated_source == "the environment's"
 
 
 def test_never_as_an_argument(unchecked):
