@@ -6,7 +6,8 @@ what comes from a VecEnv whose environments cannot be reached goes through `rece
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -17,7 +18,7 @@ from numpy import ndarray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from gym_dgpmpc.errors import EnvironmentDataError
+from gym_dgpmpc.errors import DGPMPCError, EnvironmentDataError, EnvironmentFailedError
 
 
 class Border(gymnasium.Wrapper):
@@ -25,12 +26,14 @@ class Border(gymnasium.Wrapper):
 
     Raises:
         EnvironmentDataError: `reset` or `step` returned something else than Gymnasium and the observation space say.
+        EnvironmentFailedError: it raised an exception, which is the cause.
     """
 
     keeps_task = True  # for `known.find`
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        returned = self.env.reset(seed=seed, options=options)
+        with failures_named("reset"):
+            returned = self.env.reset(seed=seed, options=options)
         if not isinstance(returned, tuple) or len(returned) != 2 or not isinstance(returned[1], Mapping):
             raise EnvironmentDataError(
                 "the environment's reset must return (observation, info), info a dict, as Gymnasium has it since 0.26, "
@@ -39,7 +42,8 @@ class Border(gymnasium.Wrapper):
         return received(returned[0], self.observation_space, "reset"), dict(returned[1])
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        returned: Any = self.env.step(np.array(action))
+        with failures_named("step"):
+            returned: Any = self.env.step(np.array(action))
         if not isinstance(returned, tuple) or len(returned) != 5 or not isinstance(returned[4], Mapping):
             size = f" of {len(returned)}" if isinstance(returned, tuple) else ""
             raise EnvironmentDataError(
@@ -54,6 +58,17 @@ class Border(gymnasium.Wrapper):
             _truth(truncated, "truncated"),
             dict(info),
         )
+
+
+@contextmanager
+def failures_named(method: str) -> Iterator[None]:
+    """What the environment's ``method`` raises becomes the cause of an `EnvironmentFailedError`."""
+    try:
+        yield
+    except DGPMPCError:
+        raise
+    except Exception as error:
+        raise EnvironmentFailedError(f"the environment's {method} raised {type(error).__name__}: {error}") from error
 
 
 def guard(vec_env: VecEnv) -> None:

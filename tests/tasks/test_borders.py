@@ -309,6 +309,17 @@ def test_an_info_that_is_shared_is_given_nothing():
     assert Sharing.info == {} and len(learner.ep_info_buffer) == 3
 
 
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_what_the_first_reset_raises_is_the_cause(num_envs):
+    class Failing(KnownPointMass):
+        def reset(self, *, seed=None, options=None):
+            raise OSError("no such plant")
+
+    with pytest.raises(EnvironmentFailedError, match=r"reset raised OSError: no such plant") as raised:
+        agent(DummyVecEnv([Failing] * num_envs)).learn(1)
+    assert isinstance(raised.value.__cause__, OSError)
+
+
 def test_a_reset_that_goes_wrong_later_costs_no_step():
     learner = agent(Returning("reset", np.array([0.25, 0.75]), episode=1))
     with pytest.raises(EnvironmentDataError, match=r"step 9: .*reset must return"):
