@@ -16,6 +16,7 @@ from jaxtyping import Float
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
+from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import UnknownRewardError
 from gym_dgpmpc.tasks.environment import about_environment, describe, flat_size
@@ -62,7 +63,8 @@ class Task:
         can_model_more: whether a model can be made that predicts more; not of a ready-made one.
 
     Raises:
-        ValueError, TypeError: see `find_functions` and `find_observation_spec`.
+        ValueError, TypeError: see `find_functions` and `find_observation_spec`, and `Encoder` for a spec that does not
+            fit the observation.
     """
 
     def __init__(
@@ -84,9 +86,11 @@ class Task:
         self._has_warned = False
         self.can_model_more = True
         self.is_exact = False
+        spec = find_observation_spec(env, given.observation_spec)
+        Encoder(flat_size(observation_space), flat_size(action_space), spec)  # an error if it fits no such observation
         self.modelled = ModelledVector(
             flat_size(observation_space),
-            find_observation_spec(env, given.observation_spec),
+            spec,
             reward=self.must_learn_reward,
         )
 

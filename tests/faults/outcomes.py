@@ -14,7 +14,7 @@ import torch
 from gymnasium import spaces
 from hypothesis import HealthCheck, Phase, given, settings
 
-from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, PETSAgent
+from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 from gym_dgpmpc.tasks.reward_guard import disagreements
 from tests.faults.worlds import (
@@ -48,6 +48,32 @@ ONCE_WRONG = (
 )
 """Worlds in which something else came out, when they were first tried."""
 
+
+class Still:
+    """A `DynamicsModel` of a world in which nothing moves, which costs nothing."""
+
+    takes_float64 = True
+
+    def fit(self, data, generator):
+        return {}
+
+    def resample(self, data, generator):
+        return {}
+
+    def draw(self, num_particles, horizon, generator):
+        return lambda observation, action, step: observation
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state):
+        assert state == {}
+
+
+def still(observation_size, action_size, observation_spec):
+    return Still()
+
+
 PLANNING = {"num_particles": 2, "horizon": 2, "num_candidates": 6, "num_elites": 2, "num_iterations": 1}
 AGENTS = {
     "DGP": (
@@ -63,6 +89,7 @@ AGENTS = {
             "resample_steps": 1,
         },
     ),
+    "still": (MPCAgent, {"dynamics": still}),
     "PETS": (PETSAgent, {"num_members": 2, "hidden_size": 4, "num_epochs": 1}),
     "GP": (GPMPCAgent, {"num_inducing": 5, "max_training_iterations": 3}),
 }
@@ -333,14 +360,15 @@ def check_predictions(world, kind, agent, recorders):
     file.seek(0)
     env, others = world.make(has_fault=False)
     given = {"reward_fn": right_reward} if world.given_reward == "right" else {}
-    loaded = kind.load(file, env, **given)
+    made_of = {"dynamics": still} if kind is MPCAgent else {}
+    loaded = kind.load(file, env, **given, **made_of)
     again, _ = loaded.predict(observation, deterministic=True)
     assert np.array_equal(told, again), f"predicted {told}, and loaded {again}"
     for name, column in agent.store.state_dict().items():
         assert torch.equal(loaded.store.state_dict()[name], column), name
     if agent.task.modelled.reward or given:
         file.seek(0)
-        alone = kind.load(file, **given)
+        alone = kind.load(file, **given, **made_of)
         vector = flat(observation, recorders[0].observation_space).astype(agent.observation_space.dtype)
         is_same_function = agent.task.functions.terminated_fn is None or agent.task.modelled.terminated
         if is_same_function:

@@ -13,6 +13,7 @@ from gym_dgpmpc.envs.performed_actions import RewardOfPerformed
 from gym_dgpmpc.envs.registration import ENVIRONMENTS
 from gym_dgpmpc.tasks.replay import EpisodeStart, can_replay
 from gym_dgpmpc.tasks.reward_guard import disagreements
+from gym_dgpmpc.types import ObservationSpec
 from gym_dgpmpc.wrappers import RiskSensitiveReward
 from tests.agents.point_mass import KnownPointMass, LinearModel, PointMass, agent
 from tests.agents.test_dgp_mpc import TINY
@@ -360,6 +361,11 @@ def test_bounds_that_float32_cannot_hold_are_refused(bound, dtype):
 @pytest.mark.parametrize("wrap", [lambda env: VecCheckNan(env, raise_exception=True), VecMonitor])
 def test_vec_wrappers_that_only_look_let_an_offered_reward_through(wrap):
     assert sources(wrap(DummyVecEnv([KnownPointMass]))) == ("the environment's", "learned")
+
+
+def test_a_spec_that_does_not_fit_is_refused_whatever_the_model_does_with_it():
+    with pytest.raises(ValueError, match=r"angles must hold distinct indices from 0 to 1 .*received \(2,\)"):
+        agent(observation_spec=ObservationSpec(angles=(2,)))
 
 
 def test_never_as_an_argument_is_kept_in_a_file(tmp_path):
