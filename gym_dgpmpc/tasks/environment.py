@@ -66,7 +66,7 @@ def check_env(env: VecEnv) -> None:
     )
     if action.dtype.kind != "f" or not flat_size(action):
         raise ValueError(
-            "the planner searches real-valued actions: the action space must be a Box of floats, one at least, got "
+            "the planner searches actions of one or more real numbers: the action space must be a Box of floats, got "
             f"{action}. "
             "gymnasium.wrappers.TransformAction can round them for an environment that takes whole numbers"
         )
@@ -109,9 +109,9 @@ def check_observation_space(space: spaces.Space) -> None:
         return check_dict_space(space)
     if not isinstance(space, spaces.Box) or len(space.shape) != 1 or space.dtype.kind != "f" or not flat_size(space):
         raise ValueError(
-            "the dynamics model learns vectors of real numbers: the observation space must be a one-dimensional Box of "
-            f"floats, one at least, or a Dict of such, got {space}. {_how_to_make_floats(space)}; images are not "
-            "supported"
+            "the dynamics model learns vectors of one or more real numbers: the observation space must be a "
+            f"one-dimensional Box of floats, or a Dict of such, got {space}. {_how_to_make_floats(space)}; images are "
+            "not supported"
         )
     return None
 
