@@ -42,6 +42,8 @@ ONCE_WRONG = (
     World(action="all fixed"),
     World(terminated_fn="a number", given_terminated="never"),
     World(reward_fn="right", vec_wrapper="VecCheckNan", num_envs=2),
+    World(observation_spec="beyond", agent="still"),
+    World(observation="Dict", wrappers=("TransformObservation",), num_envs=2),
     World(fault=Fault("step", "four values", 2)),
     World(fault=Fault("step", "terminated None", 2)),
     World(fault=Fault("step", "info None", 2), num_envs=1),

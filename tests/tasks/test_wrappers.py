@@ -387,10 +387,11 @@ def test_never_as_an_argument(unchecked):
         found(PointMass(), "never")
 
 
+MORE_OF_GYMNASIUM = ["Swimmer-v5", "Hopper-v5", "InvertedDoublePendulum-v5", "Walker2d-v5", "Pusher-v5"]
 OF_GYMNASIUM = ["Pendulum-v1", "MountainCarContinuous-v0", "Reacher-v5", "InvertedPendulum-v5", "HalfCheetah-v5"]
 
 
-@pytest.mark.parametrize("env_id", [*ENVIRONMENTS, *OF_GYMNASIUM, "Swimmer-v5", "Hopper-v5"])
+@pytest.mark.parametrize("env_id", [*ENVIRONMENTS, *OF_GYMNASIUM, *MORE_OF_GYMNASIUM])
 def test_a_rescaled_task_is_learned_for_an_episode(env_id):
     env = wrappers.TimeLimit(wrappers.RescaleAction(gym.make(env_id), -1.0, 1.0), 8)
     learner = DGPMPCAgent(env, **{**TINY, "num_layers": 1, "terminated_fn": "never"}).learn(10)
