@@ -44,6 +44,8 @@ ONCE_WRONG = (
     World(reward_fn="right", vec_wrapper="VecCheckNan", num_envs=2),
     World(observation_spec="beyond", agent="still"),
     World(observation="Dict", wrappers=("TransformObservation",), num_envs=2),
+    World(reward="(1,)", wrappers=("RecordEpisodeStatistics",), num_envs=1),
+    World(reward="tensor", wrappers=("RecordEpisodeStatistics",), num_envs=1),
     World(fault=Fault("step", "four values", 2)),
     World(fault=Fault("step", "terminated None", 2)),
     World(fault=Fault("step", "info None", 2), num_envs=1),
