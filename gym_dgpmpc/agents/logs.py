@@ -98,9 +98,14 @@ class Logs:
         """What waits; the run's folder; and of the latest episodes Monitor's numbers, [n] and NaN where one is missing.
 
         As plain values these would be most of a file whose window is wide: a line of JSON for every number. What else
-        users put into Monitor's summary may not be a number, and is left out.
+        users put into Monitor's summary may not be a number, and is left out; so is an episode of which another wrapper
+        says neither return nor length as a number.
         """
-        infos = self._agent.ep_info_buffer or ()
+        infos = [
+            info
+            for info in self._agent.ep_info_buffer or ()
+            if not _column(info.get(name) for name in ("r", "l")).isnan().any()
+        ]
         names = {name: None for info in infos for name, value in info.items() if _is_number(value)}
         columns = {_INFO + name: _column(info.get(name) for info in infos) for name in names}
         columns[_SUCCESSES] = _column(self._agent.ep_success_buffer or ())
@@ -139,9 +144,13 @@ def _waiting(name: str, value: float, weight: int, left_out_of: list[str] | None
 
 def _column(values: Iterable[Any]) -> Tensor:
     return torch.tensor(
-        [float(value) if _is_number(value) else math.nan for value in values], dtype=torch.float64, device="cpu"
+        [float(np.asarray(value).item()) if _is_number(value) else math.nan for value in values],
+        dtype=torch.float64,
+        device="cpu",
     )
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.number | np.bool_)
+    """Whether it is one number; Gymnasium's RecordEpisodeStatistics has arrays of one where rewards are such."""
+    is_array_of_one = isinstance(value, np.ndarray) and value.size == 1 and value.dtype.kind in "fiub"
+    return is_array_of_one or isinstance(value, int | float | np.number | np.bool_)

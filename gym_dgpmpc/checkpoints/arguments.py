@@ -16,7 +16,7 @@ from gym_dgpmpc.checkpoints.interface import AgentClass, HasSettings
 from gym_dgpmpc.errors import CheckpointError
 from gym_dgpmpc.planning.registry import PLANNERS
 from gym_dgpmpc.settings import LARGEST_NUMBER, Setting
-from gym_dgpmpc.tasks.functions import LEARNED
+from gym_dgpmpc.tasks.functions import LEARNED, NEVER
 from gym_dgpmpc.types import ObservationSpec, Planner, PlannerFactory
 
 AGENT_CLASSES = {
@@ -73,7 +73,7 @@ def arguments_to_load(checkpoint: Checkpoint, agent: HasSettings, replaced: Mapp
         )
     takes = {"planner", *agent.saved_settings(planner)}
     kept = {name: value for name, value in arguments.items() if name in takes}
-    return kept | _asked_to_learn(checkpoint) | dict(replaced) | {"planner": planner}
+    return kept | _asked_of_task(checkpoint) | dict(replaced) | {"planner": planner}
 
 
 def saved_arguments(
@@ -123,8 +123,8 @@ def saved_arguments(
     return {"planner": name} | {each: decode(value) for each, value in received.items()}
 
 
-def _asked_to_learn(checkpoint: Checkpoint) -> dict[str, str]:
-    """The constructor arguments by which the user asked for reward or termination to be learned.
+def _asked_of_task(checkpoint: Checkpoint) -> dict[str, str]:
+    """The constructor arguments by which the user asked for reward or termination to be learned, or said "never".
 
     Raises:
         CheckpointError: the file does not say it in the way it is written.
@@ -132,7 +132,8 @@ def _asked_to_learn(checkpoint: Checkpoint) -> dict[str, str]:
     asked = checkpoint.state("task").get("to_learn", {})
     if not isinstance(asked, dict) or not set(asked) <= {"reward_fn", "terminated_fn"}:
         raise CheckpointError(f"the file does not say what was to be learned: {asked!r}")
-    return {name: LEARNED for name, is_asked in asked.items() if is_asked is True}
+    said_never = {"terminated_fn": NEVER} if checkpoint.state("task").get("never_terminates") is True else {}
+    return said_never | {name: LEARNED for name, is_asked in asked.items() if is_asked is True}
 
 
 def encode(value: Any) -> Any:

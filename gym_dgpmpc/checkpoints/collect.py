@@ -10,6 +10,7 @@ Each noun of the agent writes and reads its own fields (`Checkpointed.nouns`); a
 """
 
 import importlib.metadata
+from functools import cache
 
 import torch
 from gymnasium import spaces
@@ -69,6 +70,7 @@ def _bounds(agent: Checkpointed) -> dict[str, Tensor]:
     return {f"{name}.{side}": torch.from_numpy(getattr(_space(agent, name), side).copy()) for name, side in sides}
 
 
+@cache
 def _version(package: str) -> str:
     try:
         return importlib.metadata.version(package.replace("_", "-"))

@@ -256,6 +256,15 @@ class PathNoise(NamedTuple):
         """What is observed of the state that this step leads to."""
         return state if self.errors is None else state + self.errors[step + 1].unsqueeze(1).to(state.dtype)
 
+    def all_observed(
+        self, states: Float[Tensor, "H_plus_1 P K S"], observation: Float[Tensor, "S"]
+    ) -> Float[Tensor, "H_plus_1 P K S"]:
+        """What is observed of a whole rollout from this observation; the states are overwritten."""
+        if self.errors is not None:
+            states[1:] += self.errors[1 : len(states)].unsqueeze(2)
+            states[0] = observation
+        return states
+
 
 def observed(
     sampler: TransitionSampler, noise: ObservationNoise | None, generator: torch.Generator

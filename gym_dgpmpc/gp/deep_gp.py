@@ -7,7 +7,7 @@ inducing outputs and the hyperparameters of what is defined here; `dynamics/` ma
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -141,6 +141,13 @@ def propagate_means(
         mean, _ = conditional(layer, factor, v, x)
         x = mean if index == last else x + mean
     return x
+
+
+def posterior_mean(factorised: Factorised, samples: Float[Tensor, "n C V"]) -> Callable[[Tensor], Tensor]:
+    """From inputs "n D" to the mean of their targets "n T" over two samples of each chain: ample for residuals."""
+    some = samples[:: -(-len(samples) // 2)]
+    whitened = factorised.model.split(some)
+    return lambda x: propagate_means(factorised, whitened, x.expand(*some.shape[:2], -1, -1)).mean((0, 1))
 
 
 def log_likelihood(

@@ -6,30 +6,34 @@ what comes from a VecEnv whose environments cannot be reached goes through `rece
 """
 
 import warnings
-from collections.abc import Mapping
-from typing import Any, SupportsFloat
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float
 from numpy import ndarray
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from gym_dgpmpc.errors import EnvironmentDataError
+from gym_dgpmpc.errors import DGPMPCError, EnvironmentDataError, EnvironmentFailedError
 
 
 class Border(gymnasium.Wrapper):
-    """Outside of all wrappers that are not ours: gives copies of actions, and takes copies of what comes back.
+    """Outside of all wrappers but Stable-Baselines3's monitor and ours: copies of actions go in, copies come out.
 
     Raises:
-        EnvironmentDataError: `reset` or `step` returned something else than the observation space says.
+        EnvironmentDataError: `reset` or `step` returned something else than Gymnasium and the observation space say.
+        EnvironmentFailedError: it raised an exception, which is the cause.
     """
 
     keeps_task = True  # for `known.find`
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        returned = self.env.reset(seed=seed, options=options)
+        with failures_named("reset"):
+            returned = self.env.reset(seed=seed, options=options)
         if not isinstance(returned, tuple) or len(returned) != 2 or not isinstance(returned[1], Mapping):
             raise EnvironmentDataError(
                 "the environment's reset must return (observation, info), info a dict, as Gymnasium has it since 0.26, "
@@ -37,16 +41,49 @@ class Border(gymnasium.Wrapper):
             )
         return received(returned[0], self.observation_space, "reset"), dict(returned[1])
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(np.array(action))
-        return received(observation, self.observation_space, "step"), reward, terminated, truncated, dict(info)
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        with failures_named("step"):
+            returned: Any = self.env.step(np.array(action))
+        if not isinstance(returned, tuple) or len(returned) != 5 or not isinstance(returned[4], Mapping):
+            size = f" of {len(returned)}" if isinstance(returned, tuple) else ""
+            raise EnvironmentDataError(
+                "the environment's step must return (observation, reward, terminated, truncated, info), info a dict, "
+                f"as Gymnasium has it since 0.26, got {type(returned).__name__}{size} {returned!r}"
+            )
+        observation, reward, terminated, truncated, info = returned
+        return (
+            received(observation, self.observation_space, "step"),
+            _number(reward, "reward"),
+            _truth(terminated, "terminated"),
+            _truth(truncated, "truncated"),
+            dict(info),
+        )
+
+
+@contextmanager
+def failures_named(method: str) -> Iterator[None]:
+    """What the environment's ``method`` raises becomes the cause of an `EnvironmentFailedError`."""
+    try:
+        yield
+    except DGPMPCError:
+        raise
+    except Exception as error:
+        raise EnvironmentFailedError(f"the environment's {method} raised {type(error).__name__}: {error}") from error
 
 
 def guard(vec_env: VecEnv) -> None:
     """Put a `Border` around every environment that runs in this process, in place; others are left as they are."""
     inner = vec_env.unwrapped
     if isinstance(inner, DummyVecEnv):
-        inner.envs = [env if _has_border(env) else Border(env) for env in inner.envs]
+        inner.envs = [env if _has_border(env) else _with_border(env) for env in inner.envs]
+
+
+def _with_border(env: gymnasium.Env) -> gymnasium.Env:
+    """The environment in a `Border`, which stands within the outermost monitors: these write into the infos."""
+    if not isinstance(env, Monitor):
+        return Border(env)
+    env.env = _with_border(env.env)
+    return env
 
 
 def _has_border(env: Any) -> bool:
@@ -108,6 +145,30 @@ def terminal_observation(info: Mapping[str, Any], shape: tuple[int, ...]) -> Flo
             f'info["terminal_observation"]; info has {list(info)}'
         )
     return _copied(info["terminal_observation"], shape, "the VecEnv handed over a terminal_observation")
+
+
+def _number(value: Any, name: str) -> float:
+    """One number, be it an array or a tensor of one.
+
+    Raises:
+        EnvironmentDataError: it is none, or more than one.
+    """
+    try:
+        return float(_copied(value, (), "")[()])
+    except EnvironmentDataError as error:
+        raise EnvironmentDataError(f"the environment's step must return one number as {name}, got {value!r}") from error
+
+
+def _truth(value: Any, name: str) -> bool:
+    """True or false, be it a number.
+
+    Raises:
+        EnvironmentDataError: it is neither.
+    """
+    number = _number(value, name)
+    if number not in (0.0, 1.0):
+        raise EnvironmentDataError(f"the environment's step must return true or false as {name}, got {value!r}")
+    return bool(number)
 
 
 def _copied(value: Any, shape: tuple[int, ...], what: str) -> ndarray:

@@ -34,20 +34,13 @@ class FlatDict(VecEnvWrapper):
         layout: where in the vector each part is.
 
     Raises:
-        ValueError: a part of the space is not a one-dimensional Box of floats.
+        ValueError: see `check_dict_space`.
     """
 
     def __init__(self, venv: VecEnv):
         space = venv.observation_space
-        assert isinstance(space, spaces.Dict), f"FlatDict is for Dict observations, got {space}"
-        for key, part in space.items():
-            if not isinstance(part, spaces.Box) or len(part.shape) != 1 or part.dtype.kind != "f":
-                raise ValueError(
-                    "every part of a Dict observation space must be a one-dimensional Box of floats, got "
-                    f"{part} for {key!r}. Leave the part out with gymnasium.wrappers.FilterObservation, or make nested "
-                    "parts one vector with FlattenObservation, and floats of whole numbers with DtypeObservation "
-                    "around it; images are not supported"
-                )
+        check_dict_space(space)
+        assert isinstance(space, spaces.Dict)
         self.dict_space = space
         boxes = [space[key] for key in sorted(space.spaces)]
         low, high = (np.concatenate([getattr(box, name) for box in boxes]) for name in ("low", "high"))
@@ -66,6 +59,25 @@ class FlatDict(VecEnvWrapper):
             for info in infos
         ]
         return flatten(observation), rewards, dones, flat_infos
+
+
+def check_dict_space(space: spaces.Space) -> None:
+    """Refuse a Dict of which no vector of real numbers can be made.
+
+    Raises:
+        ValueError: it has no parts, or one is not a one-dimensional Box of floats.
+    """
+    assert isinstance(space, spaces.Dict), f"expected a Dict of observations, got {space}"
+    if not space.spaces:
+        raise ValueError(f"a Dict observation space must have at least one part, got {space}")
+    for key, part in space.items():
+        if not isinstance(part, spaces.Box) or len(part.shape) != 1 or part.dtype.kind != "f":
+            raise ValueError(
+                "every part of a Dict observation space must be a one-dimensional Box of floats, got "
+                f"{part} for {key!r}. Leave the part out with gymnasium.wrappers.FilterObservation, or make nested "
+                "parts one vector with FlattenObservation, and floats of whole numbers with DtypeObservation "
+                "around it; images are not supported"
+            )
 
 
 def flattened(env: VecEnv) -> VecEnv:

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
 from gym_dgpmpc.tasks.borders import guard
-from gym_dgpmpc.tasks.dict_observations import flattened, layout
+from gym_dgpmpc.tasks.dict_observations import check_dict_space, flattened, layout
 from gym_dgpmpc.tasks.replay import options_to_reset, remember_starts
 
 MOVING = (gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward)
@@ -30,7 +30,9 @@ def wrapped_env(env: GymEnv | str) -> VecEnv:
         ValueError, AssertionError: see `check_env`.
     """
     _refuse_no_environment(env)
-    vec_env = flattened(BaseAlgorithm._wrap_env(maybe_make_env(env, 0)))
+    made = maybe_make_env(env, 0)
+    check_observation_space(made.observation_space)  # before Stable-Baselines3 fails at those that it cannot hold
+    vec_env = flattened(BaseAlgorithm._wrap_env(made))
     check_env(vec_env)
     guard(vec_env)
     remember_starts(vec_env)
@@ -56,20 +58,16 @@ def check_env(env: VecEnv) -> None:
             numbers, or observations or rewards that are normalised by moving statistics.
         AssertionError: an action space that is not a Box, as from every SB3 algorithm.
     """
-    observation, action = env.observation_space, env.action_space
-    if not isinstance(observation, spaces.Box) or len(observation.shape) != 1 or observation.dtype.kind != "f":
-        raise ValueError(
-            "the dynamics model learns vectors of real numbers: the observation space must be a one-dimensional Box of "
-            f"floats, or a Dict of such, got {observation}. {_how_to_make_floats(observation)}; images are not "
-            "supported"
-        )
+    check_observation_space(env.observation_space)
+    action = env.action_space
     assert isinstance(action, spaces.Box), (
         f"The algorithm only supports {spaces.Box} as action spaces but {action} was provided: "
         "the planner searches real-valued action sequences. For discrete actions see SB3's DQN or PPO"
     )
-    if action.dtype.kind != "f":
+    if action.dtype.kind != "f" or not flat_size(action):
         raise ValueError(
-            f"the planner searches real-valued actions: the action space must be a Box of floats, got {action}. "
+            "the planner searches actions of one or more real numbers: the action space must be a Box of floats, got "
+            f"{action}. "
             "gymnasium.wrappers.TransformAction can round them for an environment that takes whole numbers"
         )
     bad = ~(np.isfinite(action.low) & np.isfinite(action.high) & (action.low <= action.high))
@@ -78,6 +76,13 @@ def check_env(env: VecEnv) -> None:
         raise ValueError(
             f"the planner needs finite action bounds{where}, got low = {action.low} and high = {action.high}; "
             "gymnasium.wrappers.TransformAction(env, lambda action: action, Box(low, high)) gives an environment bounds"
+        )
+    with np.errstate(over="ignore"):  # the planner has float32
+        width = action.high.astype(np.float32) - action.low.astype(np.float32)
+    if not np.isfinite(width).all():
+        raise ValueError(
+            f"the planner needs action bounds whose distance float32 can hold, got low = {action.low} and high = "
+            f"{action.high}; gymnasium.wrappers.RescaleAction(env, -1.0, 1.0) gives an environment other bounds"
         )
     normalize = unwrap_vec_normalize(env)
     if isinstance(normalize, VecNormalize) and normalize.norm_obs:
@@ -92,6 +97,23 @@ def check_env(env: VecEnv) -> None:
             "of the reward function. Leave it out, for the dynamics model standardises for itself, or freeze it with "
             "update_running_mean = False"
         )
+
+
+def check_observation_space(space: spaces.Space) -> None:
+    """Refuse observations that are neither a vector of real numbers nor a Dict of such.
+
+    Raises:
+        ValueError: they are none.
+    """
+    if isinstance(space, spaces.Dict):
+        return check_dict_space(space)
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1 or space.dtype.kind != "f" or not flat_size(space):
+        raise ValueError(
+            "the dynamics model learns vectors of one or more real numbers: the observation space must be a "
+            f"one-dimensional Box of floats, or a Dict of such, got {space}. {_how_to_make_floats(space)}; images are "
+            "not supported"
+        )
+    return None
 
 
 def _how_to_make_floats(space: spaces.Space) -> str:

@@ -18,6 +18,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError
+from gym_dgpmpc.tasks.actions import performed
 from gym_dgpmpc.tasks.dict_observations import layout_of
 
 
@@ -43,7 +44,7 @@ def arrays(store: TransitionStore, observation_space: spaces.Space, action_space
     observation, action, after = (column.numpy() for column in store.exact_transitions())
     return {
         "observation": _in_space(observation, observation_space),
-        "action": action.reshape(-1, *action_space.shape).astype(action_space.dtype),
+        "action": performed(action, action_space),
         "next_observation": _in_space(after, observation_space),
         "reward": store.rewards.numpy().copy(),
         "terminated": store.terminated.numpy().copy(),
@@ -78,7 +79,8 @@ def replay_buffer(
     columns = arrays(store, observation_space, action_space)
     order, is_last = _by_episode(store)
     low, high = action_space.low.astype(np.float64), action_space.high.astype(np.float64)
-    scaled = 2.0 * (columns["action"] - low) / (high - low) - 1.0
+    width = np.where(high > low, high - low, 1.0)  # a number that is fixed has none
+    scaled = 2.0 * (columns["action"] - low) / width - 1.0
     kind: Any = DictReplayBuffer if isinstance(observation_space, spaces.Dict) else ReplayBuffer
     buffer = kind(max(len(store), buffer_size or 0), observation_space, action_space, device)
     for row, done in zip(order, is_last, strict=True):

@@ -159,7 +159,8 @@ def _of_chosen_actions(env: VecEnv | None, reward_fn: RewardFn) -> RewardFn:
         ChangingActionsError: see `known.offered_reward`.
     """
     while isinstance(env, VecEnvWrapper):
-        if type(env).step_async is not VecEnvWrapper.step_async and not getattr(type(env), "keeps_actions", False):
+        keeps = isinstance(env, HARMLESS_VEC_WRAPPERS) or getattr(type(env), "keeps_actions", False)
+        if type(env).step_async is not VecEnvWrapper.step_async and not keeps:
             raise ChangingActionsError(type(env).__name__)
         env = env.venv
     if isinstance(env, DummyVecEnv):

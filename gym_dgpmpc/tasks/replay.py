@@ -10,7 +10,6 @@ Actions are repeated only in simulators: a plant must not be driven by a recordi
 """
 
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -19,8 +18,9 @@ from jaxtyping import Float
 from numpy import ndarray
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from gym_dgpmpc.errors import CheckpointError, DGPMPCError, EnvironmentFailedError
+from gym_dgpmpc.errors import CheckpointError
 from gym_dgpmpc.tasks.actions import performed
+from gym_dgpmpc.tasks.borders import failures_named
 
 SIMULATORS = ("gymnasium.envs.", "gymnasium_robotics.", "gym_dgpmpc.")
 """Packages whose environments are known to be simulators."""
@@ -35,7 +35,7 @@ StepResult = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 class EpisodeStart(gymnasium.Wrapper):
     """Outermost of all wrappers: remembers how the running episode began, and what the last step returned.
 
-    What the environment raises becomes the cause of an `EnvironmentFailedError`.
+    What a monitor within it raises becomes the cause of an `EnvironmentFailedError`, as in a `Border` of `borders.py`.
     """
 
     keeps_task = True  # for `known.find`
@@ -52,27 +52,17 @@ class EpisodeStart(gymnasium.Wrapper):
         # With a seed the environment's own generator begins anew, whatever it was before.
         self.seed, self.num_steps = seed, 0
         self.generators = dict(_states(self.env, create=seed is None))
-        with _failures_named("reset"):
+        with failures_named("reset"):
             result = self.env.reset(seed=seed, options=options)
         self.options = _own_options(self.env, again=True)
         return result
 
     def step(self, action: Any) -> StepResult:
         self.last_step = None
-        with _failures_named("step"):
+        with failures_named("step"):
             self.last_step = self.env.step(action)
         self.num_steps += 1
         return self.last_step
-
-
-@contextmanager
-def _failures_named(method: str) -> Iterator[None]:
-    try:
-        yield
-    except DGPMPCError:
-        raise
-    except Exception as error:
-        raise EnvironmentFailedError(f"the environment's {method} raised {type(error).__name__}: {error}") from error
 
 
 def remember_starts(vec_env: VecEnv) -> None:

@@ -16,11 +16,20 @@ from jaxtyping import Float
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
+from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import UnknownRewardError
 from gym_dgpmpc.tasks.environment import about_environment, describe, flat_size
 from gym_dgpmpc.tasks.first_batch import REWARD_SIGNATURE, example_batch
-from gym_dgpmpc.tasks.functions import LEARNED, Learned, Never, TaskFunctions, find_functions, find_observation_spec
+from gym_dgpmpc.tasks.functions import (
+    LEARNED,
+    NEVER,
+    Learned,
+    Never,
+    TaskFunctions,
+    find_functions,
+    find_observation_spec,
+)
 from gym_dgpmpc.tasks.modelled import ModelledVector
 from gym_dgpmpc.tasks.precision import hidden_changes, in_double, warn_of_hidden_changes
 from gym_dgpmpc.types import ObservationSpec, RewardFn, StateDict, TerminatedFn, Transitions
@@ -54,7 +63,8 @@ class Task:
         can_model_more: whether a model can be made that predicts more; not of a ready-made one.
 
     Raises:
-        ValueError, TypeError: see `find_functions` and `find_observation_spec`.
+        ValueError, TypeError: see `find_functions` and `find_observation_spec`, and `Encoder` for a spec that does not
+            fit the observation.
     """
 
     def __init__(
@@ -76,9 +86,11 @@ class Task:
         self._has_warned = False
         self.can_model_more = True
         self.is_exact = False
+        spec = find_observation_spec(env, given.observation_spec)
+        Encoder(flat_size(observation_space), flat_size(action_space), spec)  # an error if it fits no such observation
         self.modelled = ModelledVector(
             flat_size(observation_space),
-            find_observation_spec(env, given.observation_spec),
+            spec,
             reward=self.must_learn_reward,
         )
 
@@ -206,6 +218,12 @@ class Task:
         given = {"reward_fn": self._given.reward_fn, "terminated_fn": self._given.terminated_fn}
         return {name: isinstance(value, str) and value == LEARNED for name, value in given.items()}
 
+    @property
+    def _said_never(self) -> bool:
+        """Whether the user said that episodes never terminate."""
+        given = self._given.terminated_fn
+        return isinstance(given, str) and given == NEVER
+
     def describe(self) -> str:
         """Where reward and termination come from, on one line, for a person."""
         return self.functions.describe(can_learn_termination=self.learns_termination)
@@ -234,6 +252,7 @@ class Task:
             "reward": self.modelled.reward,
             "terminated": self.modelled.terminated,
             "to_learn": self.to_learn,
+            "never_terminates": self._said_never,
             "is_exact": self.is_exact,
             "has_terminated_fn": has_terminated_fn or self.lacks_terminated_fn,
             "about_environment": self.about_environment(),

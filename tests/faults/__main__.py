@@ -67,6 +67,14 @@ def cases(folder, quick):
     return f"{sum(counts.values())} cases of data through learning, drawing, planning, predicting ({told})", wrong
 
 
+def worlds(folder, quick):
+    from tests.faults.outcomes import run_worlds
+
+    counts, wrong = run_worlds(50 if quick else 10_000)
+    told = ", ".join(f"{name}: {count}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
+    return f"{sum(counts.values())} environments through learning, predicting, saving, loading ({told})", wrong
+
+
 def soak(folder, quick):
     from tests.faults.soak import run_soak
 
@@ -81,6 +89,7 @@ SECTIONS = {
     "mutations": (mutations, "mutated checkpoints; only named errors, no code, bounded memory"),
     "hostile": (hostile, "hostile checkpoints; only named errors, no code, bounded memory"),
     "cases": (cases, "hard data; a finite action in bounds or a named error"),
+    "worlds": (worlds, "environments of every kind; what they returned is stored, or a named error"),
     "soak": (soak, "many episodes; steady memory and time"),
 }
 
@@ -123,7 +132,9 @@ def main():
         print(json.dumps({"tried": tried, "lost": lost}))
         return 0
     # The longest first.
-    order = sorted(arguments.only, key=("cases", "kills", "soak", "mutations", "cuts", "hostile", "disk").index)
+    order = sorted(
+        arguments.only, key=("worlds", "cases", "kills", "soak", "mutations", "cuts", "hostile", "disk").index
+    )
     with ThreadPoolExecutor(2) as pool:
         running = {pool.submit(run_section, name, arguments.quick): name for name in order}
         found = {}

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from tests.faults import cases, files, kills, soak, writes
+from tests.faults import cases, files, kills, outcomes, soak, writes
 
 needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="runs are forked, which this system cannot do")
 
@@ -51,6 +51,19 @@ def test_hard_data():
     counts, wrong = cases.run_cases(25)
     assert wrong == []
     assert sum(counts.values()) == 25
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_generated_environments(unchecked):
+    counts, wrong = outcomes.run_worlds(30)
+    assert wrong == []
+    assert sum(counts.values()) == 30
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("world", outcomes.ONCE_WRONG, ids=range(len(outcomes.ONCE_WRONG)))
+def test_environments_in_which_something_else_came_out_once(world, unchecked):
+    assert outcomes.outcome(world)
 
 
 def test_memory_and_time_stay(tmp_path, monkeypatch):

@@ -257,6 +257,69 @@ def test_what_step_should_not_return_is_named():
         agent(Returning("step", np.array([0.5]))).learn(5)
 
 
+class Answering(KnownPointMass):
+    """Answers its third step with what ``change`` makes of the five values."""
+
+    def __init__(self, change):
+        super().__init__()
+        self.change = change
+
+    def step(self, action):
+        returned = super().step(action)
+        return self.change(*returned) if self.num_steps == 3 else returned
+
+
+@pytest.mark.parametrize("make", [lambda env: env, lambda env: DummyVecEnv([lambda: env])])
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda *five: five[:4], r"step must return \(observation, reward, .*got tuple of 4 \(array"),
+        (lambda *five: five[0], r"step must return \(observation, reward, .*got ndarray array"),
+        (lambda *five: [*five], r"step must return \(observation, reward, .*got list"),
+        (lambda *five: (*five[:4], None), r"info a dict, .*got tuple of 5 .*None\)"),
+        (lambda o, r, *three: (o, None, *three), "one number as reward, got None"),
+        (lambda o, r, *three: (o, np.array([r, r]), *three), r"one number as reward, got array\("),
+        (lambda o, r, *three: (o, "high", *three), "one number as reward, got 'high'"),
+        (lambda o, r, *three: (o, r + 1j, *three), "one number as reward, got .*j"),
+        (lambda o, r, *three: (o, float("nan"), *three), "reward must be finite as float32, got nan"),
+        (lambda o, r, t, u, i: (o, r, None, u, i), "one number as terminated, got None"),
+        (lambda o, r, t, u, i: (o, r, t, np.zeros(2, bool), i), r"one number as truncated, got array\("),
+        (lambda o, r, t, u, i: (o, r, 0.5, u, i), "true or false as terminated, got 0.5"),
+    ],
+)
+def test_the_other_things_that_step_should_not_return_are_named_and_cost_no_step_before(make, change, named):
+    learner = agent(make(Answering(change)))
+    with pytest.raises(EnvironmentDataError, match=f"step 2: .*{named}"):
+        learner.learn(5)
+    assert len(learner.store) == learner.num_timesteps == 2
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.array, lambda each: np.array([each]), torch.tensor])
+def test_numbers_and_truths_of_other_kinds_are_let_in(kind):
+    env = Answering(lambda o, r, t, u, i: (o, kind(r), kind(float(t)), kind(u), i))
+    expected, found = (agent(each).learn(5).store.state_dict() for each in (KnownPointMass(), env))
+    for name, column in expected.items():
+        assert torch.equal(found[name], column), name
+
+
+def test_an_info_that_is_shared_is_given_nothing():
+    """Stable-Baselines3's monitor writes what an episode earned into the info of its last step."""
+    env = Sharing(None, SPAN, changes_actions=False, shares_array=False)
+    learner = agent(env, reward_fn=reward_fn, planner=small_planner, learning_starts=1000).learn(3 * SPAN)
+    assert Sharing.info == {} and len(learner.ep_info_buffer) == 3
+
+
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_what_the_first_reset_raises_is_the_cause(num_envs):
+    class Failing(KnownPointMass):
+        def reset(self, *, seed=None, options=None):
+            raise OSError("no such plant")
+
+    with pytest.raises(EnvironmentFailedError, match=r"reset raised OSError: no such plant") as raised:
+        agent(DummyVecEnv([Failing] * num_envs)).learn(1)
+    assert isinstance(raised.value.__cause__, OSError)
+
+
 def test_a_reset_that_goes_wrong_later_costs_no_step():
     learner = agent(Returning("reset", np.array([0.25, 0.75]), episode=1))
     with pytest.raises(EnvironmentDataError, match=r"step 9: .*reset must return"):

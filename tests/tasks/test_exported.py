@@ -211,6 +211,18 @@ def test_without_minari_the_error_names_the_extra(monkeypatch):
         export(minari_dataset, at_random(EndingPoint(), 3), "tests/point-v0")
 
 
+def test_actions_are_exported_as_their_space_contains_them():
+    class Fixed(KnownPointMass):
+        def __init__(self):
+            super().__init__()
+            self.action_space = spaces.Box(0.1, 0.1, (1,), np.float64)
+
+    learner = at_random(Fixed())
+    assert all(learner.action_space.contains(action) for action in learner.to_arrays()["action"])
+    assert np.isfinite(learner.to_replay_buffer().actions).all()
+    read_back(learner.to_arrays(), Fixed)
+
+
 def test_actions_of_two_dimensions_and_unequal_bounds(tmp_path, monkeypatch):
     class Grid(KnownPointMass):
         def __init__(self):
@@ -224,9 +236,9 @@ def test_actions_of_two_dimensions_and_unequal_bounds(tmp_path, monkeypatch):
     stored, data = rows_of(learner.store), export(arrays, learner)
     assert data["action"].shape == (len(learner.store), 1, 1) and data["action"].dtype == np.float64
     assert_equal_but_for_rounding(read_back(data, Grid), stored)
-    low, high = np.array([[-1.0]]), np.array([[2.5]])
+    low, high = np.array([[-2.0]]), np.array([[2.5]])
     buffer = replay_buffer(learner.store, learner.observation_space, spaces.Box(low, high, dtype=np.float64))
-    expected = 2.0 * (stored["action"].double() + 1.0) / 3.5 - 1.0
+    expected = 2.0 * (stored["action"].double() + 2.0) / 4.5 - 1.0
     np.testing.assert_allclose(buffer.actions[:, 0], expected, atol=2 * np.finfo(np.float32).eps)
     pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))

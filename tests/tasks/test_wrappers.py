@@ -6,13 +6,14 @@ import pytest
 import torch
 from gymnasium import spaces, wrappers
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecCheckNan, VecEnvWrapper, VecMonitor
 
 from gym_dgpmpc import DGPMPCAgent, MPCAgent
 from gym_dgpmpc.envs.performed_actions import RewardOfPerformed
 from gym_dgpmpc.envs.registration import ENVIRONMENTS
 from gym_dgpmpc.tasks.replay import EpisodeStart, can_replay
 from gym_dgpmpc.tasks.reward_guard import disagreements
+from gym_dgpmpc.types import ObservationSpec
 from gym_dgpmpc.wrappers import RiskSensitiveReward
 from tests.agents.point_mass import KnownPointMass, LinearModel, PointMass, agent
 from tests.agents.test_dgp_mpc import TINY
@@ -332,6 +333,50 @@ def test_whole_numbers_are_refused_with_what_makes_floats_of_them():
     agent(wrappers.DtypeObservation(env, np.float32))
 
 
+UNSUPPORTED = {
+    "Text": (spaces.Text(5), r"got Text\("),
+    "Tuple": (spaces.Tuple([WIDE]), r"got Tuple\(Box"),
+    "no number": (spaces.Box(-1, 1, (0,)), r"one or more real numbers.*got Box\(\[\]"),
+    "no part": (spaces.Dict(), r"at least one part, got Dict\(\)"),
+    "nested": (spaces.Dict(a=WIDE, b=spaces.Dict(c=WIDE)), r"got Dict\('c': .* for 'b'.*FlattenObservation"),
+}
+
+
+@pytest.mark.parametrize(("space", "named"), UNSUPPORTED.values(), ids=UNSUPPORTED)
+def test_observations_that_are_no_vectors_are_refused_before_anything_fails_at_them(space, named):
+    env = KnownPointMass()
+    env.observation_space = space
+    with pytest.raises(ValueError, match=named):
+        agent(env)
+
+
+@pytest.mark.parametrize(("bound", "dtype"), [(1e300, np.float64), (3e38, np.float32)])
+def test_bounds_that_float32_cannot_hold_are_refused(bound, dtype):
+    env = KnownPointMass()
+    env.action_space = spaces.Box(-bound, bound, (1,), dtype)
+    with pytest.raises(ValueError, match=r"float32 can hold, got low = \[-[13]\.?e\+.*RescaleAction"):
+        agent(env)
+
+
+@pytest.mark.parametrize("wrap", [lambda env: VecCheckNan(env, raise_exception=True), VecMonitor])
+def test_vec_wrappers_that_only_look_let_an_offered_reward_through(wrap):
+    assert sources(wrap(DummyVecEnv([KnownPointMass]))) == ("the environment's", "learned")
+
+
+def test_a_spec_that_does_not_fit_is_refused_whatever_the_model_does_with_it():
+    with pytest.raises(ValueError, match=r"angles must hold distinct indices from 0 to 1 .*received \(2,\)"):
+        agent(observation_spec=ObservationSpec(angles=(2,)))
+
+
+def test_never_as_an_argument_is_kept_in_a_file(tmp_path):
+    given = {"reward_fn": "learned", "terminated_fn": "never"}
+    DGPMPCAgent(Offering(terminated_fn=None), **TINY, **given).save(tmp_path / "agent.zip")
+    env = Offering(terminated_fn=lambda state: state[..., 0] > 0)
+    assert DGPMPCAgent.load(tmp_path / "agent.zip", env).task.functions.terminated_source == "never"
+    loaded = DGPMPCAgent.load(tmp_path / "agent.zip", env, terminated_fn=None)
+    assert loaded.task.functions.terminated_source == "the environment's"
+
+
 def test_never_as_an_argument(unchecked):
     assert sources(PointMass(), "learned", "never") == ("learned", "never")
     learner = agent(PointMass(terminate_beyond=5.0), reward_fn=KnownPointMass.reward_fn, terminated_fn="never").learn(
@@ -342,10 +387,11 @@ def test_never_as_an_argument(unchecked):
         found(PointMass(), "never")
 
 
+MORE_OF_GYMNASIUM = ["Swimmer-v5", "Hopper-v5", "InvertedDoublePendulum-v5", "Walker2d-v5", "Pusher-v5"]
 OF_GYMNASIUM = ["Pendulum-v1", "MountainCarContinuous-v0", "Reacher-v5", "InvertedPendulum-v5", "HalfCheetah-v5"]
 
 
-@pytest.mark.parametrize("env_id", [*ENVIRONMENTS, *OF_GYMNASIUM, "Swimmer-v5", "Hopper-v5"])
+@pytest.mark.parametrize("env_id", [*ENVIRONMENTS, *OF_GYMNASIUM, *MORE_OF_GYMNASIUM])
 def test_a_rescaled_task_is_learned_for_an_episode(env_id):
     env = wrappers.TimeLimit(wrappers.RescaleAction(gym.make(env_id), -1.0, 1.0), 8)
     learner = DGPMPCAgent(env, **{**TINY, "num_layers": 1, "terminated_fn": "never"}).learn(10)

@@ -206,10 +206,7 @@ class CompiledRollout:
         if failed:
             raise MemoryError("could not allocate the scratch space of a rollout, a few kilobytes for each thread")
         states = states if origin is None else states + origin
-        if errors is not None:
-            states[1:] += errors[1 : horizon + 1].unsqueeze(2)
-            states[0] = observation
-        return states
+        return states if self._noise is None else self._noise.all_observed(states, observation)
 
     def _origin(self, observation: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
         """A place near the observation that states can be told from: of an angle whole turns, which change nothing."""

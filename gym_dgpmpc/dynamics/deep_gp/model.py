@@ -35,7 +35,7 @@ from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.noise import NoiseSplit, observed, take_noise_split
 from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.errors import FactorisationError
-from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all, propagate_means
+from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all, posterior_mean
 from gym_dgpmpc.gp.kernels import Kernel, find_kernel
 from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.inference import sghmc, training
@@ -230,7 +230,7 @@ class DeepGPDynamics(Learner[_Fitted]):
         )
         factorised = factorise_all(trained.model)
         variance = factorised.model.noise_variance.mean(0)
-        noise = self._split_noise(data, normalisers, _posterior_mean(factorised, sampled.pool), variance)
+        noise = self._split_noise(data, normalisers, posterior_mean(factorised, sampled.pool), variance)
         latents = [latent.float() for latent in sampled.state.latents]
         chain, step_size = sampled.state.whitened, sampled.step_size
         self._fitted = _Fitted(factorised, normalisers, chain, latents, sampled.pool, 0, 0, step_size, noise)
@@ -418,13 +418,6 @@ class DeepGPDynamics(Learner[_Fitted]):
 def _put(whole: Tensor, where: slice, part: Tensor) -> Tensor:
     """A copy of the whole with another part in this place of its first axis."""
     return torch.cat([whole[: where.start], part, whole[where.stop :]])
-
-
-def _posterior_mean(factorised: Factorised, pool: Float[Tensor, "n C V"]) -> Callable[[Tensor], Tensor]:
-    """The mean of the standardised targets over a few samples of each chain, which is ample for residuals."""
-    some = pool[:: -(-len(pool) // 2)]
-    whitened = factorised.model.split(some)
-    return lambda x: propagate_means(factorised, whitened, x.expand(*some.shape[:2], -1, -1)).mean((0, 1))
 
 
 def _report_nothing(done: int, total: int, loss: float) -> None:
