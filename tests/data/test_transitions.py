@@ -95,7 +95,7 @@ def test_what_a_conversion_would_change_is_refused(name, value, message):
 
 
 def test_transitions_are_views_that_later_rows_do_not_change():
-    store, data = TransitionStore(S, A, capacity=64), rows(50)
+    store, data = TransitionStore(S, A, capacity=50), rows(50)
     store.extend(**part(slice(0, 20), data))
     held = store.transitions()
     assert held.observation.data_ptr() == store.transitions().observation.data_ptr()

@@ -25,7 +25,7 @@ from tests.mutation.mutants import PACKAGES, ROOT, mutants_of
 from tests.mutation.plugin import Loop, Recorder, Selection, first_failure, replace_code, replace_source
 
 RESULTS = ROOT / "build" / "mutation"
-TESTS = [f"tests/{folder}" for folder in (*PACKAGES, "agents/test_numerics.py")]
+TESTS = [f"tests/{folder}" for folder in (*PACKAGES, "test_settings.py")]
 PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "--rootdir", str(ROOT))
 LIBRARIES = (
     *("torch", "torch._dynamo", "numpy", "scipy.cluster.vq", "scipy.integrate", "scipy.linalg", "scipy.stats"),
@@ -68,17 +68,26 @@ def _merged(old, new):
 
 
 def tests_for(mutant, recorded):
-    """The tests that run the mutated line, quick ones first, as far as the budget goes."""
+    """The tests that run the mutated line (or read defaults), quick ones first, as far as the budget goes."""
     lines = {int(line): names for line, names in recorded["lines"].get(mutant.module, {}).items()}
     names = {name for line in _lines_that_show(mutant) for name in lines.get(line, ())}
-    covering = [t for t in recorded["seconds"] if t in names or t.partition("::")[0] in names]
+    names |= {"tests/test_settings.py"} if runs_at_import(mutant) else set()
+    seconds, slowest = recorded["seconds"], defaultdict(float)
+    for test in seconds:
+        slowest[_file_of(test)] = max(slowest[_file_of(test)], seconds[test])
+    covering = [test for test in seconds if test in names or _file_of(test) in names]
     chosen, total = [], 0.0
-    for test in sorted(covering, key=recorded["seconds"].get):
-        total += recorded["seconds"][test]
+    # What the tests of a file share is made by whichever comes first, so a quick one of a slow file may not be quick.
+    for test in sorted(covering, key=lambda test: seconds[test] + slowest[_file_of(test)] / 4):
+        total += seconds[test]
         if total > BUDGET and chosen:
             break
         chosen.append(test)
     return chosen
+
+
+def _file_of(test):
+    return test.partition("::")[0]
 
 
 def runs_at_import(mutant):
@@ -122,7 +131,7 @@ def run(mutants, processes):
     import_time = [mutant for mutant in mutants if runs_at_import(mutant)]
     try_all(import_time, recorded, processes, _import_and_test)
     others = [mutant for mutant in mutants if mutant not in import_time]
-    files = sorted({test.partition("::")[0] for mutant in others for test in tests_for(mutant, recorded)})
+    files = sorted({_file_of(test) for mutant in others for test in tests_for(mutant, recorded)})
     if files:
         loop = Loop(lambda items: try_all(others, recorded, processes, partial(_replace_and_test, items)))
         with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
@@ -170,8 +179,10 @@ def _import_and_test(mutant, tests):
 
     selection = Selection(tests)
     replace_source(mutant.module, mutant.source())
-    status = pytest.main([*PYTEST, *sorted({test.partition("::")[0] for test in tests})], plugins=[selection])
-    return "survived" if status == 0 else f"killed by {selection.failed or f'status {int(status)}'}"
+    status = pytest.main([*PYTEST, *sorted({_file_of(test) for test in tests})], plugins=[selection])
+    if status in (pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED):
+        return f"not tried: {status}"
+    return "survived" if status == pytest.ExitCode.OK else f"killed by {selection.failed or 'an error at import'}"
 
 
 def _replace_and_test(items, mutant, tests):
@@ -210,7 +221,7 @@ def report(mutants):
     counts = defaultdict(list)
     for mutant in mutants:
         if mutant.name in results:
-            survived = results[mutant.name]["outcome"] == "survived"
+            survived = not results[mutant.name]["outcome"].startswith("killed")
             counts[mutant.package].append(not survived)
             survivors += [results[mutant.name]] if survived else []
     for package in (*counts, None):

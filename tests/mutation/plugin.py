@@ -114,7 +114,7 @@ def _functions():
     """Every function of the package that there is, by file."""
     by_file = {}
     for function in gc.get_objects():
-        if isinstance(function, types.FunctionType):
+        if type(function) is types.FunctionType:
             by_file.setdefault(function.__code__.co_filename, []).append(function)
     return by_file
 
