@@ -251,7 +251,7 @@ def test_where_a_run_counts_as_diverged():
         assert training.is_plausible(positions) is plausible
     data = waves(20, 0)
     run = mcem.MCEM(*started(data), data, InferenceSettings())
-    for value, trouble in ((-4.0, None), (999.5, None), (1000.5, "1000.5"), (math.nan, "nan"), (math.inf, "inf")):
+    for value, trouble in ((-4.0, None), (1000.0, None), (1000.5, "1000.5"), (math.nan, "nan")):
         run.value = torch.tensor(value, dtype=torch.float64)
         said = training._advance(run, 0, seeded(), best=0.0)
         assert said is None if trouble is None else trouble in said

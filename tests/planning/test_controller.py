@@ -35,6 +35,7 @@ class Drifting:
         return {}
 
     def draw(self, num_particles, horizon, generator):
+        assert not torch.is_grad_enabled(), "a plan's memory would grow with all that is recorded"
         self.drawn.append((num_particles, horizon))
         drift = 0.01 * torch.randn(num_particles, 1, 1, generator=generator)
         return lambda observation, action, step: observation + action + drift
