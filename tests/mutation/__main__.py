@@ -1,9 +1,8 @@
 """`python -m tests.mutation`: `map` says which tests run which lines, `run` tries mutants, `report` counts them.
 
-`run` forks a process for each mutant from one that has imported the libraries and nothing of the package. The mutant's
-source takes the place of the file's in memory. The tests that run the mutated line follow, quick ones first, until one
-fails. What is known of a mutant is a line of `build/mutation/results.jsonl`, and is not tried again while its file
-stays the same.
+`run` forks a process for each mutant, gives it the mutant's code in memory, and runs the tests that run the mutated
+line, quick ones first, until one fails. What is known of a mutant is a line of `build/mutation/results.jsonl`, and is
+not tried again while its file stays the same.
 """
 
 import argparse
@@ -148,19 +147,23 @@ def try_all(mutants, recorded, processes, attempt):
             pid = os.fork()
             if pid == 0:
                 os.setpgid(0, 0)
-                _be_alone(folder)
-                (folder / "verdict").write_text(attempt(mutant, tests) if tests else "survived")
-                os._exit(0)
+                try:
+                    _be_alone(folder)
+                    (folder / "verdict").write_text(attempt(mutant, tests) if tests else "survived")
+                finally:
+                    os._exit(0)  # whatever happened: what follows is the parent's
             running[pid] = mutant, folder, time.monotonic(), limit, len(tests)
         time.sleep(0.02)
         for pid, (mutant, folder, start, limit, number) in list(running.items()):
-            seconds = time.monotonic() - start
-            if seconds > limit:
+            seconds, late = time.monotonic() - start, time.monotonic() - start > limit
+            if late:
                 os.killpg(pid, signal.SIGKILL)
-            if os.waitpid(pid, 0 if seconds > limit else os.WNOHANG)[0]:
+            ended, status = os.waitpid(pid, 0 if late else os.WNOHANG)
+            if ended:
                 verdict = folder / "verdict"
-                ended = "killed by the time limit" if seconds > limit else "killed by the end of the process"
-                keep(mutant, verdict.read_text() if verdict.exists() else ended, number, seconds)
+                crashed = "killed by the time limit" if late else f"killed by a crash, status {status}"
+                otherwise = crashed if late or os.WIFSIGNALED(status) else "not tried: the runner failed"
+                keep(mutant, verdict.read_text() if verdict.exists() else otherwise, number, seconds)
                 shutil.rmtree(folder)
                 del running[pid]
 
@@ -222,7 +225,7 @@ def report(mutants):
     print("| package | mutants | tried | killed | share | 95 % interval |\n|---|---|---|---|---|---|")
     counts = defaultdict(list)
     for mutant in mutants:
-        if mutant.name in results:
+        if results.get(mutant.name, {"outcome": "not tried"})["outcome"].startswith(("killed", "survived")):
             survived = not results[mutant.name]["outcome"].startswith("killed")
             counts[mutant.package].append(not survived)
             survivors += [results[mutant.name]] if survived else []
@@ -275,7 +278,8 @@ def main():
     if asked.what == "list":
         print("\n".join(f"{mutant.name}\n    {mutant.change()}" for mutant in mutants))
         return print(Counter(mutant.package for mutant in mutants))
-    known = {name for name, line in kept().items() if not (asked.again and line["outcome"] == "survived")}
+    final = ("killed",) if asked.again else ("killed", "survived")
+    known = {name for name, line in kept().items() if line["outcome"].startswith(final)}
     random.Random(asked.seed).shuffle(mutants)
     return run([mutant for mutant in mutants if mutant.name not in known], asked.processes, asked.budget)
 
