@@ -64,6 +64,8 @@ def test_four_units_in_the_last_place_are_taken_for_rounding(precision, magnitud
         data = share * rounding * signs
         std = Normaliser.fit(data, torch.tensor([magnitude], dtype=torch.float64), precision).std.item()
         assert std == pytest.approx(share * rounding if is_signal else 1.0, rel=1e-12)
+    four_units = Normaliser.fit(2**-21 * signs, torch.ones(1, dtype=torch.float64))  # exactly, and still rounding
+    assert four_units.std.item() == 1.0
 
 
 def test_a_small_signal_on_a_large_offset_is_kept():
