@@ -12,13 +12,14 @@ INSTALLED := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test fault-test lint clean
+.PHONY: help install demo test fault-test mutation-test lint clean
 
 help:
 	@echo "make install   set up .venv with the package and everything its development needs"
 	@echo "make demo      train on ModCartPole-v0 for a few minutes; results in demo/"
 	@echo "make test      lint, then the tests (PYTEST_ARGS=... for pytest)"
 	@echo "make fault-test  kill, cut, mutate and soak in full, for more than half an hour; table in benchmarks/results/"
+	@echo "make mutation-test  change the code in many places, one at a time, and see whether a test fails: hours"
 	@echo "make lint      ruff and mypy"
 	@echo "make clean     remove .venv, caches and demo/"
 	@echo "PYTHON=python3.12 make ... chooses the interpreter that .venv is made with (default: python3)"
@@ -57,6 +58,16 @@ test: lint
 # The full form of tests/faults, two sections at a time; `make test` runs a short form.
 fault-test: $(INSTALLED)
 	$(BIN)/python -m tests.faults
+
+# How many mutants of each package; 0: all of them.
+MUTANTS ?= 0
+
+# What was tried before is not tried again. docs/mutation.md has the results; it needs Python 3.11.
+mutation-test: $(INSTALLED)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[mutation]'
+	test -e build/mutation/map.json || $(BIN)/python -m tests.mutation map
+	$(BIN)/python -m tests.mutation run --sample $(MUTANTS)
+	$(BIN)/python -m tests.mutation report --sample $(MUTANTS)
 
 clean:
 	rm -rf $(VENV) demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -4,6 +4,10 @@ from dataclasses import dataclass
 
 import pytest
 
+from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.dynamics.ensemble import EnsembleDynamics
+from gym_dgpmpc.dynamics.sparse_gp import SparseGPDynamics
+from gym_dgpmpc.planning import CEM
 from gym_dgpmpc.settings import LARGEST_NUMBER, argument_texts, joined, refuse_unknown, settings_of
 
 
@@ -71,3 +75,54 @@ def test_two_parts_with_a_setting_of_one_name_are_refused():
 def test_an_unknown_setting_is_named_with_what_may_have_been_meant():
     with pytest.raises(TypeError, match=r"Agent.*'widht'.*'width'"):
         refuse_unknown("Agent", ["width", "widht"], settings_of(Model))
+
+
+@pytest.mark.parametrize(
+    ("part", "published"),
+    [
+        # The paper's planner on its cart-pole.
+        (CEM, {"horizon": 30, "num_candidates": 300, "num_elites": None, "num_iterations": 5, "smoothing": 0.1}),
+        # Its model; how it is trained, and what of that is not the paper's, is in docs/deviations.md.
+        (
+            DeepGPDynamics,
+            {
+                "num_layers": 2, "num_inducing": 200, "num_features": 128, "first_training_iterations": 4000,
+                "training_iterations": 1000, "num_samples": 100, "sample_spacing": 10, "resample_steps": 10,
+                "resample_samples": 5, "relocate": True, "compile": True, "step_size": 0.02, "decay": 0.05,
+                "learning_rate": 0.01, "hyperparameters_every": 1, "window_size": 100, "batch_size": 256,
+                "gibbs_every": 20, "gibbs_rows": 4096, "patience": None, "look_every": 100,
+            },
+        ),
+        # PETS's networks, their decays and their training, as its published code has them.
+        (
+            EnsembleDynamics,
+            {
+                "num_members": 5, "num_hidden_layers": 3, "hidden_size": 500, "batch_size": 32, "num_epochs": 5,
+                "weight_decay": (1e-4, 2.5e-4, 2.5e-4, 5e-4), "learning_rate": 1e-3, "half_precision": False,
+            },
+        ),
+        (
+            SparseGPDynamics,
+            {
+                "num_inducing": 200, "exact": False, "max_training_iterations": 200, "add_noise": False,
+                "update_within_episode": False,
+            },
+        ),
+    ],
+)  # fmt: skip
+def test_defaults_are_what_the_results_were_published_with(part, published):
+    """A result file says only what it was asked for, so another default would be another result of the same name."""
+    defaults = {name: setting.default for name, setting in settings_of(part).items()}
+    assert {name: defaults[name] for name in published} == published
+
+
+@pytest.mark.parametrize(
+    ("part", "largest"),
+    [
+        (CEM, {"horizon": 10_000, "num_candidates": 100_000}),
+        (DeepGPDynamics, {"num_layers": 100, "num_features": 100_000}),
+    ],
+)
+def test_files_with_numbers_up_to_these_were_written_and_have_to_be_read(part, largest):
+    settings = settings_of(part)
+    assert {name: settings[name].largest for name in largest} == largest

@@ -46,6 +46,28 @@ def test_the_rounding_of_a_difference_is_that_of_its_terms():
     assert Normaliser.fit(signal, rows.abs().amax(0)).std.item() == Normaliser.fit(signal).std.item()
 
 
+@pytest.mark.parametrize(
+    ("precision", "magnitude", "rounding"),
+    [
+        (torch.float32, 1.0, 2**-21),
+        (torch.float32, 1e6, 2**-21 * 1e6),
+        (torch.float64, 1.0, 1e-9),
+        (torch.float64, 1e9, 2**-50 * 1e9),
+        (torch.float32, 0.0, 1e-12),
+        (torch.float64, 1e-5, 2**-21 * 1e-5),
+    ],
+)
+def test_four_units_in_the_last_place_are_taken_for_rounding(precision, magnitude, rounding):
+    """In float64 a solver's own error too, 1e-9, unless float32 would resolve less; and 1e-12 in any case."""
+    signs = torch.tensor([1.0, -1.0] * 10, dtype=torch.float64).unsqueeze(1)  # of standard deviation one
+    for share, is_signal in ((0.99, False), (1.01, True)):
+        data = share * rounding * signs
+        std = Normaliser.fit(data, torch.tensor([magnitude], dtype=torch.float64), precision).std.item()
+        assert std == pytest.approx(share * rounding if is_signal else 1.0, rel=1e-12)
+    four_units = Normaliser.fit(2**-21 * signs, torch.ones(1, dtype=torch.float64))  # exactly, and still rounding
+    assert four_units.std.item() == 1.0
+
+
 def test_a_small_signal_on_a_large_offset_is_kept():
     data = 100.0 + 1e-2 * normal(seeded(), 500, 1)
     assert Normaliser.fit(data.float()).std.item() == pytest.approx(1e-2, rel=0.1)

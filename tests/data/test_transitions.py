@@ -95,7 +95,7 @@ def test_what_a_conversion_would_change_is_refused(name, value, message):
 
 
 def test_transitions_are_views_that_later_rows_do_not_change():
-    store, data = TransitionStore(S, A, capacity=64), rows(50)
+    store, data = TransitionStore(S, A, capacity=50), rows(50)
     store.extend(**part(slice(0, 20), data))
     held = store.transitions()
     assert held.observation.data_ptr() == store.transitions().observation.data_ptr()
@@ -110,6 +110,8 @@ def test_the_caller_may_reuse_its_arrays():
     store.append(observation, np.ones(A), observation, reward=0.0)
     observation[:] = 5.0
     assert torch.equal(store.transitions().observation, torch.ones(1, S))
+    # What was not said: the first episode, and that it goes on.
+    assert store.episodes.tolist() == [0] and store.terminated.tolist() == [False]
 
 
 @pytest.mark.parametrize("convert", [np.asarray, torch.tensor, list, lambda value: np.asarray(value, dtype=np.int32)])
@@ -160,6 +162,35 @@ def test_the_wrong_shape_or_kind_is_named(name, value, message):
     with pytest.raises(EnvironmentDataError, match=rf"step 0: {message}"):
         store.append(**{**part(0, rows(1)), name: value})
     assert len(store) == 0
+
+
+def test_double_precision_is_kept_beside_what_it_is_in_single():
+    data, field = rows(10), "observation"
+    data[field] += 1e9  # where float32 has steps of 64
+    store = TransitionStore(S, A, capacity=4, observation_dtype=torch.float64)
+    store.append(**part(0, data))
+    store.extend(**part(slice(1, 10), data))
+    assert_holds(store, data)
+    exact = store.exact_transitions()
+    np.testing.assert_array_equal(exact.observation, data["observation"])
+    np.testing.assert_array_equal(exact.next_observation, data["next_observation"])
+    assert torch.equal(exact.action, store.transitions().action)
+    single = TransitionStore(S, A)
+    single.extend(**data)
+    assert all(
+        a is b or torch.equal(a, b) for a, b in zip(single.transitions(), single.exact_transitions(), strict=True)
+    )
+    assert single.exact_transitions().observation.dtype == torch.float32
+
+
+def test_rows_may_be_added_in_and_after_inference_mode():
+    store, data = TransitionStore(S, A, capacity=1), rows(9)
+    with torch.inference_mode():
+        store.extend(**part(slice(0, 5), data))  # which makes new buffers
+    store.extend(**part(slice(5, 8), data))
+    store.append(**part(8, data))
+    assert_holds(store, data)
+    assert not any(field.is_inference() for field in store.transitions())
 
 
 def test_fields_of_different_lengths_are_refused():
@@ -218,3 +249,25 @@ class TestStateDict:
         with pytest.raises(CheckpointError, match=message):
             store.load_state_dict(state)
         assert_holds(store, rows(7))
+
+    def test_double_precision_is_saved_and_what_contradicts_it_is_refused(self):
+        data = rows(6)
+        data["next_observation"] += 1e9
+        source, other = (TransitionStore(S, A, observation_dtype=torch.float64) for _ in range(2))
+        source.extend(**data)
+        state = source.state_dict()
+        other.load_state_dict(state)
+        np.testing.assert_array_equal(other.exact_transitions().next_observation, data["next_observation"])
+        assert_holds(other, data)
+        # A file of a store that had float32 alone is what the float32 say.
+        single = {name: value for name, value in state.items() if not name.startswith("exact")}
+        other.load_state_dict(single)
+        assert torch.equal(other.exact_transitions().next_observation, state["next_observation"].double())
+        for name in ("observation", "next_observation"):
+            with pytest.raises(CheckpointError, match=rf"stored {name} "):
+                other.load_state_dict(state | {name: state[name] + 1000.0})
+        with pytest.raises(CheckpointError, match="'exact_observation'"):
+            other.load_state_dict(single | {"exact_observation": state["exact_observation"]})
+        with pytest.raises(CheckpointError, match="'exact_observation'"):
+            TransitionStore(S, A).load_state_dict(state)
+        assert_holds(other, data)

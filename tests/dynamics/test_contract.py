@@ -111,7 +111,9 @@ def learner(request):
 
 
 def test_it_is_a_dynamics_model(name):
-    assert isinstance(CASES[name].make(), DynamicsModel)
+    model = CASES[name].make()
+    assert isinstance(model, DynamicsModel)
+    assert model.takes_float64, "an agent would round what float32 hides"
 
 
 def test_rollouts_have_the_states_shape_and_are_finite(name):

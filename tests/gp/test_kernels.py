@@ -37,6 +37,18 @@ def test_the_in_place_form_agrees(kernel, dtype):
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
+def test_the_in_place_form_ends_at_exp_of_minus_60(kernel):
+    """Where s^2 (of the RBF r^2 / 2) is larger the value stays there, so that single precision has no subnormals."""
+    kernel = KERNELS[kernel]
+    scale = abs(kernel.argument_scale)
+    ends = torch.tensor([60.0**2 / scale if scale >= 1 else 60.0 / scale], dtype=torch.float32)
+    exact = float(kernel.correlation(ends.double()))
+    for sqdist in (ends, 4 * ends, 1e6 * ends):
+        found = float(kernel.correlation_(kernel.argument_scale * sqdist))
+        assert found == pytest.approx(exact, rel=60 * 2**-23)  # rounding of s, which is 60
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
 def test_coincident_points_have_unit_correlation_even_if_rounding_makes_them_negative(kernel):
     sqdist = torch.tensor([0.0, -1e-16, -1e-7], dtype=torch.float64, requires_grad=True)
     kernel = KERNELS[kernel]

@@ -2,10 +2,14 @@
 
 import math
 
+import numpy as np
+import pytest
 import torch
+from scipy.optimize import OptimizeResult
 
 from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.dynamics.deep_gp.start import initial_model
+from gym_dgpmpc.gp.deep_gp import DeepGP
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.gp.sgpr import collapsed_bound
 from gym_dgpmpc.inference.lbfgs import LENGTHSCALES, NOISE_VARIANCES, maximise_bound
@@ -63,3 +67,26 @@ def test_it_starts_within_bounds_and_says_how_often_it_looked():
     start = start._replace(log_noise=torch.full_like(start.log_noise, -100.0))
     found = maximise_bound(start, data, 1)
     assert math.isfinite(found.bound) and found.num_evaluations >= 1
+
+
+@pytest.mark.parametrize(("variance", "kept"), [(1e-30, 1e-4), (1e30, 1e4)])
+def test_a_start_beyond_the_limits_is_moved_to_them(monkeypatch, variance, kept):
+    """Beyond them covariances cannot be factorised. An optimiser that stays where it starts shows the start."""
+
+    def stay(function, start, bounds, **settings):
+        low, high = np.array(bounds).T
+        assert ((low <= start) & (start <= high)).all()
+        return OptimizeResult(x=start, fun=function(start)[0], nfev=1)
+
+    monkeypatch.setattr("gym_dgpmpc.inference.lbfgs.minimize", stay)
+    data, generator = problem(num_data=30)
+    start = initial_model(KERNELS["rbf"], data, 1, 10, generator)
+    layer = start.layers[0]._replace(
+        log_lengthscale=torch.tensor([1e-30, 1e30]).double().log(), log_variance=torch.tensor(variance).double().log()
+    )
+    found = maximise_bound(DeepGP((layer,), torch.tensor([1e-30, 1e30]).double().log()), data, 1)
+    (moved,) = found.model.layers
+    assert moved.lengthscale.tolist() == pytest.approx([0.01, 1e3], rel=1e-12)
+    assert float(moved.variance) == pytest.approx(kept, rel=1e-12)
+    assert found.model.log_noise.exp().tolist() == pytest.approx([1e-6, 10.0], rel=1e-12)
+    assert torch.equal(moved.inducing_inputs, layer.inducing_inputs)

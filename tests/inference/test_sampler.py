@@ -146,3 +146,43 @@ def test_hyperparameters_see_every_position_of_the_window_alike(monkeypatch):
         counts += (run.window == seen.pop()).all(dim=1)
     assert counts.sum() == num_steps  # each was one of the window, and its rows differ
     assert scipy.stats.chisquare(counts.numpy()).pvalue > 1e-4
+
+
+@pytest.mark.parametrize(("every", "drawn"), [(0, []), (1, [0, 1, 2, 3, 4]), (3, [0, 3])])
+def test_the_last_layer_is_drawn_as_often_as_asked(monkeypatch, every, drawn):
+    model, data = one_layer()
+    settings = InferenceSettings(gibbs_every=every)
+    run = mcem.MCEM(model, sghmc.init(normal(seeded(1), model.num_whitened())), data, settings)
+    original, seen, generator = mcem.gibbs_step, [], seeded()
+
+    def watched(*args):
+        seen.append(run.iteration)
+        return original(*args)
+
+    monkeypatch.setattr(mcem, "gibbs_step", watched)
+    for _ in range(5):
+        run.step(generator)
+    assert seen == drawn
+    # Each sample of a pool gets one, however often training draws.
+    seen.clear()
+    list(mcem.sample(factorise_all(model), run.chain, data, 4, 2, generator, settings))
+    assert len(seen) == (4 if every else 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "bad"),
+    [
+        ("decay", (0.0, 1.0), (-1e-9, 1.0 + 1e-9)),
+        ("step_size", (1e-300, 10.0), (0.0, -1.0, float("inf"), float("nan"))),
+        ("learning_rate", (1e-300, 10.0), (0.0, -1.0, float("inf"), float("nan"))),
+        ("gibbs_every", (0, 1), (-1,)),
+        ("patience", (None, 1), (0,)),
+        ("window_size", (1,), (0,)),
+    ],
+)
+def test_settings_have_ranges_of_which_the_ends_are_told(name, good, bad):
+    for value in good:
+        assert getattr(InferenceSettings(**{name: value}), name) == value
+    for value in bad:
+        with pytest.raises(ValueError, match=rf"{name} .*{value}"):
+            InferenceSettings(**{name: value})

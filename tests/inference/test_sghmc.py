@@ -33,6 +33,14 @@ def test_a_step_leaves_its_argument_alone():
     assert all(torch.equal(a, b) for a, b in zip(state, before, strict=True))
 
 
+def test_without_further_arguments_it_is_the_sampler_of_havasi_et_al():
+    """Step size 0.01 and friction 0.05, in burn-in."""
+    state, gradient = sghmc.init(normal(seeded(), 3)), normal(seeded(1), 3)
+    found = sghmc.step(state, gradient, 10, seeded(2))
+    expected = sghmc.step(state, gradient, 10, seeded(2), step_size=0.01, decay=0.05, burn_in=True)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
 def test_the_preconditioner_learns_the_gradients_size():
     """For gradients of N(m, s^2) the mass is sqrt(m^2 + s^2), to the precision of the averaging window."""
     generator, scale = seeded(), torch.tensor([1e-3, 1.0, 100.0], dtype=torch.float64)

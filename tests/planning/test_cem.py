@@ -51,6 +51,13 @@ def test_a_tenth_of_the_candidates_are_elites(num_candidates, num_elites):
     assert CEM(**bounds([-1.0], [1.0]), num_candidates=num_candidates).num_elites == num_elites
 
 
+def test_all_candidates_may_be_elites():
+    """The mean of all of K candidates of standard deviation s errs by s / sqrt(K)."""
+    cem = CEM(**bounds([-1.0], [1.0]), horizon=4, num_candidates=400, num_elites=400, num_iterations=1, smoothing=0.0)
+    plan, _ = cem.plan(lambda actions: actions.sum(dim=(1, 2)), cem.initial_plan(), seeded())
+    assert plan.mean.abs().max() < 5 * 0.5 / math.sqrt(400)
+
+
 def test_every_plan_starts_from_a_quarter_of_the_range():
     cem = CEM(**bounds([-3.0, 0.0], [3.0, 2.0]), horizon=2)
     plan = cem.initial_plan()

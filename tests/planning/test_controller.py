@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import scipy.stats
 import torch
 from gymnasium import spaces
 
@@ -34,6 +35,7 @@ class Drifting:
         return {}
 
     def draw(self, num_particles, horizon, generator):
+        assert not torch.is_grad_enabled(), "a plan's memory would grow with all that is recorded"
         self.drawn.append((num_particles, horizon))
         drift = 0.01 * torch.randn(num_particles, 1, 1, generator=generator)
         return lambda observation, action, step: observation + action + drift
@@ -81,6 +83,19 @@ def test_any_planner_controls(name):
     assert (ages, planned) == ([1, 0, 1, 0], [True, False, True, False])
     assert control.dynamics.drawn == [(3, 4)] * 2
     assert control.num_late == 0
+
+
+def test_actions_without_a_plan_are_the_middle_and_uniform_ones():
+    """The Kolmogorov distance exceeds 2.23 / sqrt(n) with probability 1e-4 under the right law."""
+    space = spaces.Box(np.array([[-1.0, 4.0]]), np.array([[3.0, 4.0]]), dtype=np.float64)
+    planner = RandomShooting(torch.tensor([-1.0, 4.0]), torch.tensor([3.0, 4.0]), horizon=4)
+    control, generator = Controller(Drifting(), planner, space), seeded()
+    assert control.midpoint().tolist() == [1.0, 4.0]
+    drawn = np.stack([control.uniform(generator) for _ in range(2000)])
+    assert drawn.dtype == np.float32 and (drawn[:, 1] == 4.0).all()
+    assert scipy.stats.kstest(drawn[:, 0], scipy.stats.uniform(-1.0, 4.0).cdf).statistic < 2.23 / math.sqrt(2000)
+    # Five particles, one for each network of PETS, and a plan for each action, unless another number is asked for.
+    assert (control.num_particles, control.actions_per_plan, control.time_budget) == (5, 1, None)
 
 
 def test_plans_made_together_may_share_their_worlds():

@@ -107,6 +107,14 @@ def test_every_step_gets_its_own_action_and_index():
     assert torch.equal(states, expected.transpose(0, 1)[:, None].expand(4, 5, 4, 2))
 
 
+def test_nothing_is_recorded_for_a_gradient():
+    """A learned model and a learned reward have parameters; a plan's memory would grow with its steps."""
+    weight, actions = torch.ones(1, requires_grad=True), torch.ones(2, 3, 1)
+    states = rollout(lambda observation, action, step: weight * observation + action, torch.zeros(1), actions, 2)
+    returns = particle_returns(states, actions, lambda x, u, after: (weight * after).sum(-1))
+    assert not states.requires_grad and not returns.requires_grad
+
+
 def test_the_reward_is_one_call_on_all_steps_with_matching_triples():
     calls = []
 

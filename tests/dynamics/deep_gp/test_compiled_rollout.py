@@ -140,6 +140,14 @@ def test_far_from_the_inducing_inputs_and_on_them(kernel):
         assert compiled < max(10 * by_torch, 1e-6 * observation.abs().max(), 1e-5)
 
 
+@pytest.mark.parametrize(("num_inducing", "num_features"), [(16, 32), (16, 21), (13, 32), (1, 1)])
+def test_inducing_inputs_and_features_may_fill_their_blocks_or_not(num_inducing, num_features):
+    """Blocks are of 8: what is padded computes nothing, and nothing beyond it is read."""
+    draw = Draw("matern32", 2, num_inducing=num_inducing, num_features=num_features)
+    compiled, by_torch = errors(draw, draw.actions(7))
+    assert compiled < max(10 * by_torch, 1e-5)
+
+
 def test_every_layer_may_have_a_kernel_of_its_own():
     kernels = ("matern12", "rbf", "matern72")
     draw = Draw(kernels, 3)

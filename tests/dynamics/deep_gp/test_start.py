@@ -8,7 +8,7 @@ import torch
 
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.data.standardised import Data
-from gym_dgpmpc.dynamics.deep_gp.start import INNER_VARIANCE, cluster, initial_model, relocate, restandardise
+from gym_dgpmpc.dynamics.deep_gp.start import cluster, initial_model, relocate, restandardise
 from gym_dgpmpc.gp.deep_gp import factorise_all, log_likelihood, propagate
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.gp.layer import conditional
@@ -139,10 +139,11 @@ def test_rows_that_are_all_the_same_are_quietly_clustered_and_factorised(num_row
 def test_the_initial_model_has_the_published_settings(num_layers):
     data = Data(normal(seeded(), 30, 4), normal(seeded(1), 30, 2))
     model = initial_model(KERNELS["matern32"], data, num_layers, 10, seeded(2))
-    assert [round(float(layer.variance), 6) for layer in model.layers] == [INNER_VARIANCE] * (num_layers - 1) + [1.0]
+    assert [round(float(layer.variance), 6) for layer in model.layers] == [0.01] * (num_layers - 1) + [1.0]
     for layer in model.layers:
         assert layer.kernel is KERNELS["matern32"]
         assert layer.inducing_inputs.shape == (10, 4)
         torch.testing.assert_close(layer.lengthscale, torch.full((4,), 2.0, dtype=torch.float64))
     assert len({layer.inducing_inputs.data_ptr() for layer in model.layers}) == num_layers, "each its own"
     assert model.noise_variance.shape == (2,)
+    torch.testing.assert_close(model.log_noise.exp(), torch.full((2,), 0.05, dtype=torch.float64))
