@@ -95,7 +95,7 @@ def moments(terms: LayerTerms, whitened: Float[Tensor, "C M O"], seen: Seen, lea
 
 def forward(
     terms: Sequence[LayerTerms],
-    whitened: Sequence[Float[Tensor, "C M O"]],
+    whitened: Sequence[Tensor],
     x: Float[Tensor, "C n D"],
     latents: Sequence[Float[Tensor, "C n D"]],
     first: Seen | None = None,
@@ -137,7 +137,7 @@ def take_passed(passed: Passed, rows: Int[Tensor, "C n"]) -> Passed:
 def gradients(
     factorised: Factorised,
     terms: Sequence[LayerTerms],
-    whitened: Sequence[Float[Tensor, "C M O"]],
+    whitened: Sequence[Tensor],
     passed: Sequence[Passed],
     latents: Sequence[Float[Tensor, "C n D"]],
     y: Float[Tensor, "n T"],

@@ -14,6 +14,9 @@ from gym_dgpmpc.gp.deep_gp import DeepGP
 
 WIDTH = 1.5
 
+FARTHEST = 15.0
+"""From the centre, of a logarithm that is plausible: ten standard deviations, a factor of three million."""
+
 INNER_VARIANCE = 0.01
 NOISE_VARIANCE = 0.05
 
@@ -26,6 +29,12 @@ def log_lengthscale_centre(input_size: int) -> float:
 def log_variance_centre(*, last: bool) -> float:
     """Of a layer's kernel: the targets' own variance for the last; inner layers begin close to the identity."""
     return 0.0 if last else math.log(INNER_VARIANCE)
+
+
+def are_plausible(model: DeepGP) -> bool:
+    """Whether kernel and noise variances are finite and not absurd. Long lengthscales are no fault: see ARD."""
+    variances = [layer.log_variance for layer in model.layers] + [model.log_noise]
+    return all(bool((value.abs() < FARTHEST).all()) for value in variances)
 
 
 def log_prior_gradient(model: DeepGP) -> list[Tensor]:

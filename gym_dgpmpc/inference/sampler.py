@@ -166,8 +166,8 @@ class Chains:
         state: where to start; preconditioners are kept.
         data: what is conditioned on.
         settings: of the sampler.
-        num_burn_in: iterations in which preconditioners adapt, and Adam moves the hyperparameters. After them
-            preconditioners stay, since one that follows the chain makes it wander too far, and "sampled"
+        num_burn_in: iterations in which Adam moves the hyperparameters, and the preconditioner of the inducing outputs
+            adapts. After them that stays, since one that follows the chain makes it wander too far, and "sampled"
             hyperparameters are moved by SG-HMC, "optimised" ones by Adam as before.
     """
 
@@ -320,6 +320,7 @@ class Chains:
             gradient = gradient + prior / num_data
         gradient = -gradient
         if sampled and self.iteration > self._num_burn_in:
+            # Its preconditioner goes on adapting: where Adam ended gradients vanish, and would allow far too large steps.
             parameters = sghmc.step(
                 parameters,
                 gradient,
@@ -327,11 +328,10 @@ class Chains:
                 generator,
                 step_size=settings.hyperparameter_step_size,
                 decay=settings.decay,
-                burn_in=False,
+                burn_in=True,
             )
         else:
-            if self.iteration <= self._num_burn_in:
-                parameters = sghmc.adapt(parameters, gradient)
+            parameters = sghmc.adapt(parameters, gradient)
             done = self.iteration / max(self._num_burn_in, 1)
             self._optimiser.param_groups[0]["lr"] = settings.learning_rate * LAST_LEARNING_RATE ** min(done, 1.0)
             self._flat.copy_(parameters.position)
@@ -379,7 +379,7 @@ class Snapshot(NamedTuple):
 def move_latents(
     factorised: Factorised,
     terms: list[LayerTerms],
-    whitened: list[Float[Tensor, "C M O"]],
+    whitened: list[Tensor],
     batch: Data,
     latents: list[Float[Tensor, "C n D"]],
     generator: torch.Generator,

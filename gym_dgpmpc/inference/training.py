@@ -17,7 +17,7 @@ from torch import Tensor
 from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.errors import FactorisationError, TrainingError
 from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, log_likelihood, propagate
-from gym_dgpmpc.inference import sampler
+from gym_dgpmpc.inference import priors, sampler
 from gym_dgpmpc.inference.sampler import Chains, ChainState, InferenceSettings
 from gym_dgpmpc.inference.sghmc import SGHMCState
 
@@ -185,6 +185,8 @@ def _advance(run: Chains, num_iterations: int, generator: torch.Generator, best:
     if not math.isfinite(value) or not is_plausible(position):
         largest = float(position.abs().max())
         return f"the negative log likelihood is {value:g}, the largest whitened inducing output {largest:g}"
+    if not priors.are_plausible(run.model):
+        return "a hyperparameter left the range of its prior by far"
     if value > best + EXPLODED:
         return f"the negative log likelihood rose from {best:g} to {value:g} per transition"
     return None
