@@ -14,8 +14,8 @@ from gym_dgpmpc.gp.deep_gp import DeepGP
 
 WIDTH = 1.5
 
-FARTHEST = 15.0
-"""From the centre, of a logarithm that is plausible: ten standard deviations, a factor of three million."""
+LARGEST = 15.0
+"""Of the logarithm of a variance that is plausible, ten standard deviations from the centre: three million."""
 
 INNER_VARIANCE = 0.01
 NOISE_VARIANCE = 0.05
@@ -32,9 +32,9 @@ def log_variance_centre(*, last: bool) -> float:
 
 
 def are_plausible(model: DeepGP) -> bool:
-    """Whether kernel and noise variances are finite and not absurd. Long lengthscales are no fault: see ARD."""
+    """Whether kernel and noise variances are finite and not absurd. Long lengthscales, and no noise, are no fault."""
     variances = [layer.log_variance for layer in model.layers] + [model.log_noise]
-    return all(bool((value.abs() < FARTHEST).all()) for value in variances)
+    return all(bool((value < LARGEST).all()) for value in variances)
 
 
 def log_prior_gradient(model: DeepGP) -> list[Tensor]:
