@@ -101,7 +101,7 @@ def cases(draw):
             "num_inducing": draw(st.integers(1, 6)),
             "draw": draw(st.sampled_from(sorted(DRAWS))),
             "refresh": draw(st.sampled_from(sorted(REFRESHES))),
-            "num_features": draw(st.integers(1, 4)),
+            "num_features": 2 * draw(st.integers(1, 2)),
             "num_particles": draw(st.integers(1, 3)),
             "horizon": draw(st.integers(1, 4)),
             "num_candidates": draw(st.integers(2, 8)),

@@ -5,10 +5,17 @@ import pytest
 import scipy.stats
 import torch
 
-from gym_dgpmpc.gp.deep_gp import NOISE_FLOOR, factorise_all, log_likelihood, propagate
+from gym_dgpmpc.gp.deep_gp import (
+    NOISE_FLOOR,
+    factorise_all,
+    log_likelihood,
+    posterior_mean,
+    propagate,
+    propagate_means,
+)
 from gym_dgpmpc.gp.kernels import KERNELS
 from tests.oracles import gaussian_process
-from tests.oracles.models import dense, make_model, normal, seeded
+from tests.oracles.models import chains, dense, make_model, normal, seeded
 
 
 @pytest.mark.parametrize("num_layers", [1, 2, 3])
@@ -117,3 +124,56 @@ def test_the_noise_has_a_floor():
     model = make_model(1, 3, 2, 5, seeded())
     vanishing = model._replace(log_noise=torch.full((2,), -1e3, dtype=torch.float64))
     assert vanishing.noise_variance.tolist() == [NOISE_FLOOR] * 2
+
+
+def two_chains(num_layers):
+    """Two models, also side by side, and a whitened sample of each."""
+    generator = seeded(6)
+    models = [make_model(num_layers, 3, 2, 5, generator, "matern52") for _ in range(2)]
+    return models, chains(*models), normal(generator, 2, models[0].num_whitened()), normal(generator, 4, 3)
+
+
+@pytest.mark.parametrize("num_layers", [1, 2, 3])
+def test_the_models_of_chains_are_each_on_its_own(num_layers, monkeypatch):
+    models, together, whitened, x = two_chains(num_layers)
+    assert together.output_sizes() == models[0].output_sizes()
+    assert (together.num_whitened(), together.num_inner()) == (models[0].num_whitened(), models[0].num_inner())
+    noise, target = normal(seeded(8), 4, 3), normal(seeded(9), 4, 2)
+    # The same noise for all chains, so that each can be asked alone.
+    monkeypatch.setattr(torch, "randn", lambda shape, **_: noise.expand(shape))
+    factorised = factorise_all(together)
+    mean, variance = propagate(factorised, together.split(whitened), x.expand(2, -1, -1), seeded())
+    means = propagate_means(factorised, together.split(whitened), x.expand(2, -1, -1))
+    density = log_likelihood(together, mean, variance, target)
+    for c, model in enumerate(models):
+        alone = factorise_all(model)
+        own_mean, own_variance = propagate(alone, model.split(whitened[c]), x, seeded())
+        torch.testing.assert_close(mean[c], own_mean, rtol=0, atol=1e-8)
+        torch.testing.assert_close(variance[c], own_variance, rtol=0, atol=1e-8)
+        own_means = propagate_means(alone, model.split(whitened[c]), x)
+        torch.testing.assert_close(means[c], own_means, rtol=0, atol=1e-8)
+        own_density = log_likelihood(model, mean[c], variance[c], target)
+        torch.testing.assert_close(density[c], own_density, rtol=1e-12, atol=1e-12)
+
+
+def test_chains_may_be_picked_and_multiplied():
+    models, together, _, _ = two_chains(2)
+    picked = together.at(torch.tensor([1, 0, 1]))
+    expected = chains(models[1], models[0], models[1])
+    assert all(torch.equal(a, b) for a, b in zip(picked.parameters(), expected.parameters(), strict=True))
+    everywhere = models[0].at_all(3)
+    expected = chains(models[0], models[0], models[0])
+    assert all(torch.equal(a, b) for a, b in zip(everywhere.parameters(), expected.parameters(), strict=True))
+
+
+@pytest.mark.parametrize(("num_samples", "rows"), [(1, [0]), (2, [0, 1]), (5, [0, 3])])
+def test_the_posterior_mean_is_that_of_two_samples_of_each_chain(num_samples, rows):
+    models, together, _, x = two_chains(2)
+    pool = normal(seeded(1), num_samples, 2, together.num_whitened())
+    each = [
+        propagate_means(factorise_all(model), model.split(pool[row, c]), x)
+        for row in rows
+        for c, model in enumerate(models)
+    ]
+    found = posterior_mean(factorise_all(together), pool)(x)
+    torch.testing.assert_close(found, torch.stack(each).mean(0), rtol=0, atol=1e-8)

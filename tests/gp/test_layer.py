@@ -7,7 +7,7 @@ import torch
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.gp.layer import Layer, conditional, factorise, joint_conditional
 from tests.oracles import gaussian_process
-from tests.oracles.models import dense, make_model, normal, seeded
+from tests.oracles.models import chains, dense, make_model, normal, seeded
 
 TOLERANCE = 1e-8  # float64 rounding times the condition number of K_zz, at most M / jitter = 1e7
 
@@ -70,3 +70,24 @@ def test_the_gradient_reaches_hyperparameters_and_inducing_points(kernel):
         return conditional(moved, factorise(moved), whitened, x)
 
     assert torch.autograd.gradcheck(outputs, tensors)
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_layers_of_chains_are_each_on_its_own(kernel, batch):
+    generator = seeded(1)
+    models = [make_model(1, 3, 2, 7, generator, kernel) for _ in range(2)]
+    layers = [models[0].layers[0], models[1].layers[0]._replace(log_variance=torch.tensor(-0.7).double())]
+    together = chains(*(model._replace(layers=(layer,)) for model, layer in zip(models, layers, strict=True))).layers[0]
+    v, x = normal(generator, *batch, 2, 7, 2), normal(generator, *batch, 2, 4, 3)
+    factor = factorise(together)
+    for each in (conditional, joint_conditional):
+        mean, covariance = each(together, factor, v, x)
+        alone = [
+            each(layer, factorise(layer), v[..., c, :, :], x[..., c, :, :]) for c, layer in enumerate(layers)
+        ]
+        torch.testing.assert_close(mean, torch.stack([m for m, _ in alone], dim=len(batch)), rtol=0, atol=TOLERANCE)
+        expected = torch.stack([c for _, c in alone], dim=len(batch))
+        torch.testing.assert_close(covariance, expected, rtol=0, atol=TOLERANCE)
+    for c, layer in enumerate(layers):
+        torch.testing.assert_close(factor[c], factorise(layer), rtol=1e-12, atol=1e-12)

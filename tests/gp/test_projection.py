@@ -46,6 +46,22 @@ def test_the_gradient_is_that_of_automatic_differentiation(kernel):
         torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6 * float(b.detach().abs().max()))
 
 
+@pytest.mark.parametrize("batch", [(), (P,)])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_chains_side_by_side_are_each_on_its_own(kernel, batch):
+    """A leading axis of inducing inputs is one of the points too, after those of their own; gradients included."""
+    x, z = points(*batch, 2, N, D).requires_grad_(), points(2, M, D).requires_grad_()
+    factor = torch.stack([factor_of(kernel, each) for each in z.detach()])
+    weights = points(*batch, 2, M, N)
+    together = projection(KERNELS[kernel], x, z, factor)
+    found = torch.autograd.grad((weights * together).sum(), (x, z))
+    alone = [projection(KERNELS[kernel], x[..., c, :, :], z[c], factor[c]) for c in range(2)]
+    torch.testing.assert_close(together, torch.stack(alone, dim=-3))
+    one_by_one = sum((weights[..., c, :, :] * alone[c]).sum() for c in range(2))
+    for a, b in zip(found, torch.autograd.grad(one_by_one, (x, z)), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
 def test_only_what_is_asked_for_is_computed():
     z, x = points(M, D), points(N, D).requires_grad_()
     projection(KERNELS["matern32"], x, z, factor_of("matern32", z)).sum().backward()

@@ -90,7 +90,8 @@ class DeepGPDynamics(Learner[_Fitted]):
         draw: how a world is drawn from the posterior: "pathwise" (whole functions), "joint" (values, jointly over the
             candidate sequences, as in the paper) or "marginal" (values, each candidate on its own).
         refresh: when a particle of a "pathwise" draw gets a new function: at each "step" of a plan, or once per "plan".
-        num_features: random features of a "pathwise" draw, F; the error of its prior covariance falls as F^-1/2.
+        num_features: random features of a "pathwise" draw, F, an even number; the error of its prior covariance falls
+            as F^-1/2.
         first_training_iterations: training iterations of the first fit, of one SG-HMC step each; every few of them move
             the hyperparameters.
         training_iterations: training iterations of each later fit, which goes on from the fit before.
@@ -165,6 +166,8 @@ class DeepGPDynamics(Learner[_Fitted]):
             sample_spacing=sample_spacing,
             resample_samples=resample_samples,
         )
+        if num_features % 2:
+            raise ValueError(f"num_features must be even, a cosine and a sine of each frequency: received {num_features}")
         if resample_steps < 0:
             raise ValueError(f"resample_steps must be at least 0, received {resample_steps}")
         if draw not in DRAWS:
