@@ -13,7 +13,7 @@ _LADDER = (1.0, 10.0, 100.0, 1e3, 1e4)
 
 
 def cholesky(
-    covariance: Float[Tensor, "*b n n"], scale: Float[Tensor, ""], jitter: float = JITTER
+    covariance: Float[Tensor, "*b n n"], scale: Float[Tensor, ""] | Float[Tensor, "*b 1 1"], jitter: float = JITTER
 ) -> Float[Tensor, "*b n n"]:
     """Lower Cholesky factor of ``covariance + jitter * scale * I``, differentiable.
 
@@ -21,7 +21,7 @@ def cholesky(
 
     Args:
         covariance: symmetric and positive semi-definite up to rounding.
-        scale: the kernel's variance, which the jitter is relative to.
+        scale: the kernel's variance, which the jitter is relative to; of all matrices, or of each.
 
     Raises:
         FactorisationError: the matrix is not finite, or not positive definite with the largest jitter.

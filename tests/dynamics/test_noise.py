@@ -12,6 +12,7 @@ from gym_dgpmpc.dynamics.noise import (
     NoiseSplit,
     ObservationNoise,
     ObservedSampler,
+    PathNoise,
     consecutive,
     split_noise,
     take_noise_split,
@@ -182,3 +183,13 @@ def test_what_is_fed_undoes_the_flatness_of_what_was_fitted():
     flat = 0.8 * (noise.fed(state) - 3.0)
     assert torch.allclose(flat, state - 3.0)
     assert torch.allclose(noise.start_std, (torch.tensor([0.04], dtype=torch.float64) / 0.8).sqrt())
+
+
+def test_process_noise_has_the_size_of_each_particles_own():
+    """A standard deviation from H draws errs by (2 H)^-1/2 of itself; and no particle's luck is another's."""
+    std, horizon = torch.tensor([[0.1, 2.0], [0.5, 0.0], [3.0, 1.0]], dtype=torch.float64), 10_000
+    noise = PathNoise.draw(std, None, horizon, 3, torch.float64, seeded())
+    assert noise.process.shape == (horizon, 3, 2) and noise.observation is None
+    torch.testing.assert_close(noise.process.std(0), std, rtol=5 / math.sqrt(2 * horizon), atol=0)
+    correlation = noise.process[..., [0]].flatten(1).mT.corrcoef()
+    assert (correlation - torch.eye(3).double()).abs().max() < 5 / math.sqrt(horizon)

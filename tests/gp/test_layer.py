@@ -83,9 +83,7 @@ def test_layers_of_chains_are_each_on_its_own(kernel, batch):
     factor = factorise(together)
     for each in (conditional, joint_conditional):
         mean, covariance = each(together, factor, v, x)
-        alone = [
-            each(layer, factorise(layer), v[..., c, :, :], x[..., c, :, :]) for c, layer in enumerate(layers)
-        ]
+        alone = [each(layer, factorise(layer), v[..., c, :, :], x[..., c, :, :]) for c, layer in enumerate(layers)]
         torch.testing.assert_close(mean, torch.stack([m for m, _ in alone], dim=len(batch)), rtol=0, atol=TOLERANCE)
         expected = torch.stack([c for _, c in alone], dim=len(batch))
         torch.testing.assert_close(covariance, expected, rtol=0, atol=TOLERANCE)

@@ -1,28 +1,49 @@
-"""Moving-window MCEM: its gradients and its chain against the closed-form posterior."""
+"""The chains: their gradients and where they settle, against closed forms; and when which part of them moves."""
+
+import math
 
 import numpy as np
 import pytest
 import scipy.stats
 import torch
 
-from gym_dgpmpc.data.standardised import Data, minibatch
+from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.gp import exact
 from gym_dgpmpc.gp.deep_gp import factorise_all
 from gym_dgpmpc.gp.kernels import KERNELS
-from gym_dgpmpc.inference import mcem, sghmc
+from gym_dgpmpc.gp.layer import conditional
+from gym_dgpmpc.inference import sampler, sghmc
 from gym_dgpmpc.inference.diagnostics import effective_sample_size
-from gym_dgpmpc.inference.mcem import InferenceSettings
+from gym_dgpmpc.inference.gradients import forward, gradients, layer_terms
+from gym_dgpmpc.inference.sampler import LAST_LEARNING_RATE, Chains, InferenceSettings, initial_state
 from tests.oracles import sghmc as oracle
-from tests.oracles.models import make_model, normal, seeded
+from tests.oracles.models import chains, make_model, normal, seeded
+
+NEVER = 10**9
 
 
-def one_layer(kernel="rbf", num_data=8):
-    """A model with fixed hyperparameters, data, and the exact posterior of v in the layout of the flat vector."""
+def one_layer(kernel="rbf", num_data=8, num_chains=1):
+    """Models with fixed hyperparameters, one for each chain, and data."""
     generator = seeded(5)
-    model = make_model(1, 2, 2, 5, generator, kernel)
-    model = model._replace(log_noise=torch.tensor([0.3, 0.6], dtype=torch.float64).log())
-    data = Data(normal(generator, num_data, 2), normal(generator, num_data, 2))
-    return model, data
+    models = []
+    for c in range(num_chains):
+        model = make_model(1, 2, 2, 5, generator, kernel)
+        models.append(model._replace(log_noise=torch.tensor([0.3, 0.6 + 0.2 * c], dtype=torch.float64).log()))
+    return models, Data(normal(generator, num_data, 2), normal(generator, num_data, 2))
+
+
+def two_layers(num_chains=2, num_data=9, kernel="matern32"):
+    generator = seeded(5)
+    models = [make_model(2, 2, 2, 5, generator, kernel) for _ in range(num_chains)]
+    return models, Data(normal(generator, num_data, 2), normal(generator, num_data, 2))
+
+
+def started(models, data, settings=None, num_burn_in=0, position=None):
+    model = chains(*models)
+    if position is None:
+        position = normal(seeded(1), len(models), model.num_whitened())
+    state = initial_state(model, sghmc.init(position), data.num_rows, seeded(2))
+    return Chains(model, state, data, settings or InferenceSettings(), num_burn_in)
 
 
 def flat_posterior(model, data):
@@ -36,148 +57,365 @@ def flat_posterior(model, data):
     return posterior.mean.flatten(), precision.reshape(num_inducing * outputs, -1)
 
 
+@pytest.fixture
+def seen_gradients(monkeypatch):
+    """What SG-HMC is told, of inducing outputs and of hyperparameters, by how many there are."""
+    seen, original = [], sghmc.step
+
+    def watched(state, gradient, num_data, *args, **kwargs):
+        seen.append((gradient, num_data, kwargs))
+        return original(state, gradient, num_data, *args, **kwargs)
+
+    monkeypatch.setattr(sghmc, "step", watched)
+    return seen
+
+
+@pytest.mark.parametrize("num_chains", [1, 2])
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_the_gradient_is_that_of_the_closed_form_posterior(kernel):
-    model, data = one_layer(kernel)
-    mean, precision = flat_posterior(model, data)
-    v = normal(seeded(1), len(mean)).requires_grad_()
-    value = mcem.negative_log_joint(factorise_all(model), v, data, 8, seeded())
-    (gradient,) = torch.autograd.grad(value, v)
-    torch.testing.assert_close(gradient, precision @ (v.detach() - mean) / 8, rtol=1e-8, atol=1e-10)
+def test_chains_are_moved_by_the_gradient_of_the_closed_form_posterior(kernel, num_chains, seen_gradients):
+    models, data = one_layer(kernel, num_chains=num_chains)
+    run = started(models, data)
+    before = run.state.whitened.position.clone()
+    run.step(seeded())
+    ((gradient, num_data, _),) = seen_gradients
+    assert num_data == 8
+    for c, model in enumerate(models):
+        mean, precision = flat_posterior(model, data)
+        torch.testing.assert_close(gradient[c], precision @ (before[c] - mean) / 8, rtol=1e-8, atol=1e-10)
 
 
 def test_gradients_of_minibatches_are_unbiased():
-    """Without hidden noise (one layer) the mean over all batches of one row is the full gradient exactly."""
-    model, data = one_layer("matern32")
-    factorised, v = factorise_all(model), normal(seeded(1), model.num_whitened()).requires_grad_()
+    """The mean over all batches of one row is the full gradient exactly, of each row with its own latents."""
+    models, data = two_layers()
+    model = chains(*models)
+    whitened, latent = normal(seeded(1), 2, model.num_whitened()), normal(seeded(2), 2, 9, 2)
+    factorised, terms = factorise_all(model), layer_terms(factorise_all(model))
 
-    def gradient(batch):
-        value = mcem.negative_log_joint(factorised, v, batch, len(data.x), seeded())
-        return torch.autograd.grad(value, v)[0]
+    def of(rows):
+        batch = data.rows(rows)
+        passed = forward(terms, model.split(whitened), batch.x.expand(2, -1, -1), [latent[:, rows]])
+        found = gradients(
+            factorised, terms, model.split(whitened), passed, [latent[:, rows]], batch.y, of_parameters=True
+        )
+        return torch.cat([found.whitened, sampler.flatten(found.parameters)], dim=1)
 
-    singles = [gradient(Data(x, y)) for x, y in zip(data.x.split(1), data.y.split(1), strict=True)]
-    torch.testing.assert_close(torch.stack(singles).mean(0), gradient(data), rtol=1e-10, atol=1e-12)
+    singles = torch.stack([of(torch.tensor([n])) for n in range(9)])
+    torch.testing.assert_close(singles.mean(0), of(torch.arange(9)), rtol=1e-9, atol=1e-10)
 
 
-def test_minibatches_are_drawn_uniformly_and_keep_rows_together():
+def test_minibatches_are_drawn_uniformly_and_keep_rows_and_latents_together():
+    models, _ = two_layers(num_data=1)
     rows = torch.arange(10, dtype=torch.float64).unsqueeze(1)
-    data, generator, counts = Data(rows, rows + 100.0), seeded(), torch.zeros(10)
+    data, generator, counts = Data(rows.expand(-1, 2), rows.expand(-1, 2) + 100.0), seeded(), torch.zeros(10)
+    run = started(models, data, InferenceSettings(batch_size=4))
     for _ in range(2000):
-        batch = minibatch(data, 4, generator)
-        assert batch.x.shape == (4, 1) and torch.equal(batch.y, batch.x + 100.0)
-        counts += torch.bincount(batch.x.long().flatten(), minlength=10)
+        batch, index = run._batch(4, generator)
+        assert batch.x.shape == (4, 2) and torch.equal(batch.y, batch.x + 100.0)
+        assert torch.equal(batch.x[:, 0].long(), index)
+        counts += torch.bincount(index, minlength=10)
     assert scipy.stats.chisquare(counts.numpy()).pvalue > 1e-4
-    assert minibatch(data, 10, generator) is data and minibatch(data, 11, generator) is data
+    for size in (10, 11):
+        assert run._batch(size, generator) == (data, None)
+    # Only the latents of the drawn rows are moved, if any are accepted: of a hundred proposals some are.
+    moved = torch.zeros(2, 10, dtype=torch.bool)
+    for step in range(50):
+        before, twin = run.state.latents[0].clone(), seeded(step)
+        index = torch.randint(10, (4,), generator=twin)
+        run.step(seeded(step))
+        changed = (run.state.latents[0] != before).any(-1)
+        assert not changed[:, [n for n in range(10) if n not in index]].any()
+        moved |= changed
+    assert moved.all()
 
 
+@pytest.mark.usefixtures("unchecked")  # thousands of steps
 @pytest.mark.parametrize(("kernel", "num_data"), [("rbf", 8), ("matern32", 24)])
 def test_samples_follow_the_closed_form_posterior(kernel, num_data):
-    """Mean and covariance of v, tolerances from the chain's exact autocovariances, its step-size bias included."""
-    model, data = one_layer(kernel, num_data)
-    mean, precision = flat_posterior(model, data)
-    hessian = precision.numpy() / num_data
-    inverse_mass = 1.0 / np.diagonal(hessian).copy()
+    """Mean and covariance of v, tolerances from the chain's exact autocovariances, its step-size bias included.
+
+    Of two chains, each against the posterior under its own hyperparameters.
+    """
+    models, data = one_layer(kernel, num_data, num_chains=2)
     settings = InferenceSettings(step_size=0.6, decay=0.4, gibbs_every=0)
-    lags = oracle.autocovariances(hessian, inverse_mass, num_data, settings.step_size, settings.decay, 600)
-    # The discretisation is visible, but small beside the posterior itself.
-    np.testing.assert_allclose(np.diagonal(lags[0]), np.diagonal(np.linalg.inv(precision)), rtol=0.25)
-
+    means, precisions = zip(*(flat_posterior(model, data) for model in models), strict=True)
+    inverse_mass = num_data / torch.stack(precisions).diagonal(dim1=1, dim2=2)
     num_samples, spacing, burn_in = 1200, 2, 30
-    start = sghmc.init(mean)._replace(square=torch.from_numpy(inverse_mass) ** -2)
-    chains = list(mcem.sample(factorise_all(model), start, data, burn_in + num_samples, spacing, seeded(), settings))
-    samples = torch.stack([chain.position for chain in chains[burn_in:]]).numpy()
-    lags = np.concatenate([np.swapaxes(lags[spacing::spacing], 1, 2), lags[::spacing]])  # both directions of time
-    error = samples.mean(0) - mean.numpy()
-    statistic = error @ np.linalg.solve(lags.sum(0) / num_samples, error)
-    assert scipy.stats.chi2(len(mean)).sf(statistic) > 1e-4
+    run = started(models, data, settings, position=torch.stack(means))
+    run.state = run.state._replace(whitened=run.state.whitened._replace(square=inverse_mass**-2))
+    positions = list(sampler.sample(run, burn_in + num_samples, spacing, seeded()))
+    by_chain = torch.stack(positions[burn_in:]).movedim(1, 0)
+    for samples, mean, precision, mass in zip(by_chain.numpy(), means, precisions, inverse_mass.numpy(), strict=True):
+        hessian = precision.numpy() / num_data
+        lags = oracle.autocovariances(hessian, mass, num_data, settings.step_size, settings.decay, 600)
+        # The discretisation is visible, but small beside the posterior itself.
+        np.testing.assert_allclose(np.diagonal(lags[0]), np.diagonal(np.linalg.inv(precision)), rtol=0.25)
+        lags = np.concatenate([np.swapaxes(lags[spacing::spacing], 1, 2), lags[::spacing]])  # both directions of time
+        error = samples.mean(0) - mean.numpy()
+        statistic = error @ np.linalg.solve(lags.sum(0) / num_samples, error)
+        assert scipy.stats.chi2(len(mean)).sf(statistic) > 1e-4
 
-    # Var of a product of Gaussians (Isserlis), summed over lags: the variance of each entry of the sample covariance.
-    variance = np.einsum("kii,kjj->ij", lags, lags) + np.einsum("kij,kji->ij", lags, lags)
-    deviation = (
-        np.cov(samples.T)
-        - oracle.stationary_covariance(hessian, inverse_mass, num_data, settings.step_size, settings.decay)
-    ) / np.sqrt(variance / num_samples)
-    assert abs(deviation).max() < 4.5
+        # Var of a product of Gaussians (Isserlis), summed over lags: the variance of each entry of the covariance.
+        variance = np.einsum("kii,kjj->ij", lags, lags) + np.einsum("kij,kji->ij", lags, lags)
+        deviation = (
+            np.cov(samples.T)
+            - oracle.stationary_covariance(hessian, mass, num_data, settings.step_size, settings.decay)
+        ) / np.sqrt(variance / num_samples)
+        assert abs(deviation).max() < 4.5
 
-    # And the diagnostics see the mixing that the oracle knows.
-    known = num_samples * lags[len(lags) // 2].diagonal() / lags.sum(0).diagonal()
-    effective = effective_sample_size(torch.from_numpy(samples)).numpy()
-    assert np.median(effective / known) == pytest.approx(1.0, abs=0.3)
-
-
-def test_sampling_keeps_the_preconditioner_and_the_spacing():
-    model, data = one_layer()
-    start = sghmc.init(torch.zeros(model.num_whitened(), dtype=torch.float64))
-    every = list(mcem.sample(factorise_all(model), start, data, 6, 1, seeded(), InferenceSettings(gibbs_every=0)))
-    second = list(mcem.sample(factorise_all(model), start, data, 3, 2, seeded(), InferenceSettings(gibbs_every=0)))
-    for a, b in zip(every[1::2], second, strict=True):
-        assert torch.equal(a.position, b.position)
-        assert torch.equal(b.square, start.square) and torch.equal(b.averaging, start.averaging)
+        # And the diagnostics see the mixing that the oracle knows.
+        known = num_samples * lags[len(lags) // 2].diagonal() / lags.sum(0).diagonal()
+        effective = effective_sample_size(torch.from_numpy(samples)).numpy()
+        assert np.median(effective / known) == pytest.approx(1.0, abs=0.3)
 
 
-def test_the_prior_weighs_less_the_more_data_there_are():
-    """With a batch that repeats the same rows only |v|^2 / (2 N) changes with N."""
-    model, data = one_layer()
-    factorised, v = factorise_all(model), normal(seeded(1), model.num_whitened())
-    values = [mcem.negative_log_joint(factorised, v, data, n, seeded()).item() for n in (8, 80)]
-    assert values[0] - values[1] == pytest.approx(0.5 * v.square().sum().item() * (1 / 8 - 1 / 80), rel=1e-10)
+def test_sampling_keeps_preconditioners_hyperparameters_and_the_spacing():
+    """One layer: with latents the moves of every other step would have to fall together, too."""
+    models, data = one_layer(num_chains=2)
+    settings = InferenceSettings(gibbs_every=0, hyperparameters_every=1)
+    every, second = started(models, data, settings), started(models, data, settings)
+    one_by_one = list(sampler.sample(every, 6, 1, seeded()))
+    for a, b in zip(one_by_one[1::2], sampler.sample(second, 3, 2, seeded()), strict=True):
+        assert torch.equal(a, b)
+    start = started(models, data, settings).state
+    for name in ("square", "averaging", "gradient"):
+        assert torch.equal(getattr(second.state.whitened, name), getattr(start.whitened, name))
+    assert all(torch.equal(a, b) for a, b in zip(second.state.parameters, start.parameters, strict=True))
 
 
-def test_hyperparameters_see_every_position_of_the_window_alike(monkeypatch):
-    model, data = one_layer()
+def test_the_prior_weighs_less_the_more_data_there_are(seen_gradients):
+    """Where all rows are the same, only the share of the prior, v / N, changes with N."""
+    models, data = one_layer()
+    found = []
+    for num_data in (8, 80):
+        same = Data(data.x[:1].repeat(num_data, 1), data.y[:1].repeat(num_data, 1))
+        run = started(models, same, InferenceSettings(batch_size=8))
+        v = run.state.whitened.position.clone()
+        run.step(seeded())
+        gradient, seen_num_data, _ = seen_gradients.pop()
+        assert seen_num_data == num_data
+        found.append(gradient)
+    torch.testing.assert_close(found[0] - found[1], v * (1 / 8 - 1 / 80), rtol=1e-9, atol=1e-10)
+
+
+def uncertain(model):
+    """With an inner layer that leaves much to its latents, of which the data then say something."""
+    inner, last = model.layers
+    inner = inner._replace(log_variance=torch.zeros_like(inner.log_variance), log_lengthscale=inner.log_lengthscale - 2)
+    return model._replace(layers=(inner, last), log_noise=torch.full_like(model.log_noise, math.log(0.02)))
+
+
+def test_a_datums_latents_settle_in_their_conditional_law():
+    """Against quadrature over the one latent of a datum; 3000 rows that are the same are as many independent chains.
+
+    Two chains of them, under hyperparameters and inducing outputs of their own.
+    """
+    generator = seeded(3)
+    models = [uncertain(make_model(2, 1, 1, 6, generator, "matern32")) for _ in range(2)]
+    together, num = chains(*models), 3000
+    whitened = 1.5 * normal(generator, 2, together.num_whitened())
+    x, y = torch.tensor([[0.4]], dtype=torch.float64), torch.tensor([[0.8]], dtype=torch.float64)
+    factorised, data = factorise_all(together), Data(x.repeat(num, 1), y.repeat(num, 1))
+    terms, latents = layer_terms(factorised), [normal(generator, 2, num, 1)]
+    for _ in range(100):
+        _, latents = sampler.move_latents(factorised, terms, together.split(whitened), data, latents, generator)
+    nodes, weights = (torch.from_numpy(part) for part in np.polynomial.hermite_e.hermegauss(200))
+    for c, model in enumerate(models):
+        factors, split = factorise_all(model).factors, model.split(whitened[c])
+        mean, variance = conditional(model.layers[0], factors[0], split[0], x)
+        hidden = x + mean + variance.sqrt().unsqueeze(-1) * nodes.unsqueeze(1)
+        last_mean, last_variance = conditional(model.layers[1], factors[1], split[1], hidden)
+        std = (last_variance + model.noise_variance).sqrt()
+        law = weights * torch.distributions.Normal(last_mean.squeeze(1), std).log_prob(y.squeeze(1)).exp()
+        law = law / law.sum()
+        first = float(law @ nodes)
+        second, fourth = (float(law @ (nodes - first) ** power) for power in (2, 4))
+        assert abs(first) > 0.2 or abs(second - 1.0) > 0.2, "the datum says something of its latent"
+        found = latents[0][c, :, 0]
+        assert found.mean().item() == pytest.approx(first, abs=5 * math.sqrt(second / num))
+        assert found.var().item() == pytest.approx(second, abs=5 * math.sqrt((fourth - second**2) / num))
+
+
+def test_moved_points_are_those_of_the_moved_latents():
+    models, data = two_layers()
+    model = chains(*map(uncertain, models))
+    factorised, generator = factorise_all(model), seeded(4)
+    terms, whitened = layer_terms(factorised), model.split(normal(generator, 2, model.num_whitened()))
+    before = [normal(generator, 2, 9, 2)]
+    passed, after = sampler.move_latents(factorised, terms, whitened, data, before, generator)
+    accepted = (after[0] != before[0]).any(-1)
+    assert accepted.any() and not accepted.all()
+    for one, other in zip(passed, forward(terms, whitened, data.x.expand(2, -1, -1), after), strict=True):
+        for a, b in zip((*one.seen, one.mean, one.variance), (*other.seen, other.mean, other.variance), strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-10)
+
+
+def test_latents_of_new_rows_are_drawn_and_the_others_stay():
+    latents = [normal(seeded(1), 2, 3, 4), normal(seeded(2), 2, 3, 4)]
+    grown = sampler.with_latents(latents, 5000, seeded())
+    for old, new in zip(latents, grown, strict=True):
+        assert new.shape == (2, 5000, 4) and torch.equal(new[:, :3], old)
+        assert new.std().item() == pytest.approx(1.0, abs=5 / math.sqrt(2 * 40_000))
+    assert abs(float(torch.stack([grown[0].flatten(), grown[1].flatten()]).corrcoef()[0, 1])) < 5 / math.sqrt(40_000)
+    assert all(torch.equal(a, b) for a, b in zip(sampler.with_latents(latents, 3, seeded()), latents, strict=True))
+
+
+@pytest.mark.parametrize("hyperparameters", ["sampled", "optimised"])
+def test_chains_do_not_feel_each_other(hyperparameters):
+    """Another start of the second, whatever it leads to, leaves every number of the first as it is."""
+    models, data = two_layers(num_data=20)
+    settings = InferenceSettings(hyperparameters=hyperparameters, batch_size=8, hyperparameters_every=2, gibbs_every=5)
+    ends = []
+    for other in (models[1], make_model(2, 2, 2, 5, seeded(77), "matern32")):
+        position = normal(seeded(1), 2, models[0].num_whitened())
+        if other is not models[1]:
+            position[1] = 3.0 * normal(seeded(9), models[0].num_whitened())
+        run = started([models[0], other], data, settings, num_burn_in=6, position=position)
+        generator = seeded(4)
+        for _ in range(12):
+            run.step(generator)
+        ends.append(run.state)
+    for first, second in zip(
+        (*ends[0].whitened, *ends[0].parameters, *ends[0].latents),
+        (*ends[1].whitened, *ends[1].parameters, *ends[1].latents),
+        strict=True,
+    ):
+        assert torch.equal(first[0], second[0])
+    assert not (ends[0].whitened.position[1] == ends[1].whitened.position[1]).any()
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("num_chains", [1, 2])
+def test_hyperparameters_see_every_position_of_the_window_alike(num_chains, monkeypatch):
+    models, data = one_layer(num_chains=num_chains)
     size, num_steps = 4, 400
-    run = mcem.MCEM(
-        model, sghmc.init(normal(seeded(1), model.num_whitened())), data, InferenceSettings(window_size=size)
-    )
-    original, seen = mcem.negative_log_joint, []
+    settings = InferenceSettings(hyperparameters="optimised", window_size=size, hyperparameters_every=1)
+    run = started(models, data, settings, num_burn_in=NEVER)
+    original, seen = Chains._gradients, []
 
-    def watched(factorised, whitened, batch, num_data, generator):
-        if not whitened.requires_grad:  # the M-step; the gradient of the E-step is the position's
-            seen.append(whitened.clone())
-        return original(factorised, whitened, batch, num_data, generator)
+    def watched(self, position, *args, **kwargs):
+        seen.append(position.clone())  # the last of a step is that of the hyperparameters
+        return original(self, position, *args, **kwargs)
 
-    monkeypatch.setattr(mcem, "negative_log_joint", watched)
+    monkeypatch.setattr(Chains, "_gradients", watched)
     generator, counts = seeded(), torch.zeros(size)
     for _ in range(size - 1):
         run.step(generator)
-    seen.clear()
     for _ in range(num_steps):
         run.step(generator)
-        counts += (run.window == seen.pop()).all(dim=1)
+        counts += (run._window == seen[-1]).all(dim=(1, 2))
     assert counts.sum() == num_steps  # each was one of the window, and its rows differ
     assert scipy.stats.chisquare(counts.numpy()).pvalue > 1e-4
 
 
+def test_hyperparameters_that_are_optimised_follow_the_likelihood(seen_gradients):
+    """Adam's first step has the size of its learning rate, up the likelihood's gradient; no prior is added."""
+    models, data = one_layer(num_chains=2)
+    settings = InferenceSettings(hyperparameters="optimised", hyperparameters_every=1, gibbs_every=0)
+    run = started(models, data, settings)
+    before, position = run.state.parameters.position.clone(), run.state.whitened.position.clone()
+    together = chains(*models)
+    factorised = factorise_all(together)
+    terms, split = layer_terms(factorised), together.split(position)
+    passed = forward(terms, split, data.x.expand(2, -1, -1), [])
+    uphill = sampler.flatten(gradients(factorised, terms, split, passed, [], data.y, of_parameters=True).parameters)
+    run.step(seeded())
+    step = run.state.parameters.position - before
+    # Without a burn-in the learning rate is at its end from the first step on.
+    expected = settings.learning_rate * LAST_LEARNING_RATE * uphill / (uphill.abs() + 1e-8)
+    torch.testing.assert_close(step, expected, rtol=1e-6, atol=1e-12)
+    assert len(seen_gradients) == 1, "SG-HMC moves the inducing outputs alone"
+
+
+def test_the_learning_rate_falls_geometrically_until_the_end_of_the_burn_in():
+    models, data = one_layer()
+    run = started(models, data, InferenceSettings(hyperparameters="optimised", hyperparameters_every=1), num_burn_in=8)
+    generator, rates = seeded(), []
+    for _ in range(10):
+        run.step(generator)
+        rates.append(run._optimiser.param_groups[0]["lr"])
+    expected = [InferenceSettings().learning_rate * LAST_LEARNING_RATE ** min(done / 8, 1.0) for done in range(1, 11)]
+    assert rates == pytest.approx(expected, rel=1e-12)
+
+
+def test_after_the_burn_in_hyperparameters_are_sampled_under_their_prior(seen_gradients):
+    """Before it Adam moves them, and the preconditioner of the inducing outputs adapts."""
+    models, data = one_layer(num_chains=2)
+    settings = InferenceSettings(hyperparameters_every=1, gibbs_every=0)
+    run, generator = started(models, data, settings, num_burn_in=3), seeded()
+    num_whitened = run.state.whitened.position.shape[1]
+    burning_in = []
+    for _ in range(3):
+        run.step(generator)
+        burning_in += [kwargs["burn_in"] for *_, kwargs in seen_gradients]
+        assert not run.state.parameters.momentum.any() and len(seen_gradients) == 1
+        seen_gradients.clear()
+    assert burning_in == [True, True, True]
+    # Adam adapts the preconditioner that SG-HMC is going to use.
+    assert not (run.state.parameters.square == 1.0).any()
+    square = run.state.whitened.square.clone()
+    for _ in range(2):
+        before = run.model, run.state.whitened.position
+        run.step(generator)
+        (first, second), num_data = seen_gradients, data.num_rows
+        seen_gradients.clear()
+        assert first[0].shape[1] == num_whitened and not first[2]["burn_in"]
+        assert second[1] == num_data and second[2]["step_size"] == settings.hyperparameter_step_size
+        leaves = [parameter.clone().requires_grad_() for parameter in before[0].parameters()]
+        model = before[0].with_parameters(leaves)
+        value = 0.0
+        for c in range(2):
+            one = model.with_parameters([leaf[c] for leaf in leaves])
+            (v,) = one.split(before[1][c])
+            mean, variance = conditional(one.layers[0], factorise_all(one).factors[0], v, data.x)
+            std = (variance.unsqueeze(-1) + one.noise_variance).sqrt()
+            value = value - torch.distributions.Normal(mean, std).log_prob(data.y).sum() / num_data
+            centres = (one.layers[0].log_lengthscale, math.log(2) / 2), (one.layers[0].log_variance, 0.0)
+            for parameter, centre in (*centres, (one.log_noise, math.log(0.05))):
+                value = value - torch.distributions.Normal(centre, 1.5).log_prob(parameter).sum() / num_data
+            value = (
+                value - torch.distributions.Normal(0.0, 1.0).log_prob(one.layers[0].inducing_inputs).sum() / num_data
+            )
+        expected = sampler.flatten(list(torch.autograd.grad(value, leaves)))
+        torch.testing.assert_close(second[0], expected, rtol=1e-6, atol=1e-7)
+    assert run.state.parameters.momentum.all()
+    assert torch.equal(run.state.whitened.square, square)
+
+
+@pytest.mark.parametrize("num_chains", [1, 2])
 @pytest.mark.parametrize(("every", "drawn"), [(0, []), (1, [0, 1, 2, 3, 4]), (3, [0, 3])])
-def test_the_last_layer_is_drawn_as_often_as_asked(monkeypatch, every, drawn):
-    model, data = one_layer()
-    settings = InferenceSettings(gibbs_every=every)
-    run = mcem.MCEM(model, sghmc.init(normal(seeded(1), model.num_whitened())), data, settings)
-    original, seen, generator = mcem.gibbs_step, [], seeded()
+def test_the_last_layer_is_drawn_as_often_as_asked(monkeypatch, every, drawn, num_chains):
+    models, data = one_layer(num_chains=num_chains)
+    run = started(models, data, InferenceSettings(gibbs_every=every))
+    original, seen, generator = Chains.draw_last_layer, [], seeded()
 
-    def watched(*args):
-        seen.append(run.iteration)
-        return original(*args)
+    def watched(self, generator):
+        seen.append(self.iteration)
+        original(self, generator)
 
-    monkeypatch.setattr(mcem, "gibbs_step", watched)
+    monkeypatch.setattr(Chains, "draw_last_layer", watched)
     for _ in range(5):
         run.step(generator)
     assert seen == drawn
     # Each sample of a pool gets one, however often training draws.
     seen.clear()
-    list(mcem.sample(factorise_all(model), run.chain, data, 4, 2, generator, settings))
+    positions = list(sampler.sample(run, 4, 2, generator))
     assert len(seen) == (4 if every else 0)
+    assert torch.stack(positions).shape == (4, num_chains, 10)
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("name", "good", "bad"),
     [
         ("decay", (0.0, 1.0), (-1e-9, 1.0 + 1e-9)),
         ("step_size", (1e-300, 10.0), (0.0, -1.0, float("inf"), float("nan"))),
+        ("hyperparameter_step_size", (1e-300, 10.0), (0.0, -1.0, float("inf"), float("nan"))),
         ("learning_rate", (1e-300, 10.0), (0.0, -1.0, float("inf"), float("nan"))),
         ("gibbs_every", (0, 1), (-1,)),
         ("patience", (None, 1), (0,)),
         ("window_size", (1,), (0,)),
+        ("hyperparameters_every", (1,), (0,)),
+        ("hyperparameters", ("sampled", "optimised"), ("fixed",)),
     ],
 )
 def test_settings_have_ranges_of_which_the_ends_are_told(name, good, bad):

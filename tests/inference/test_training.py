@@ -10,8 +10,8 @@ from gym_dgpmpc.dynamics.deep_gp.start import initial_model
 from gym_dgpmpc.errors import FactorisationError, TrainingError
 from gym_dgpmpc.gp.deep_gp import factorise_all, log_likelihood, propagate
 from gym_dgpmpc.gp.kernels import KERNELS
-from gym_dgpmpc.inference import mcem, sghmc, training
-from gym_dgpmpc.inference.mcem import InferenceSettings
+from gym_dgpmpc.inference import sampler, sghmc, training
+from gym_dgpmpc.inference.sampler import Chains, InferenceSettings
 from gym_dgpmpc.inference.training import predictive_log_likelihood, train
 from tests.oracles.models import normal, seeded
 
@@ -25,80 +25,109 @@ def waves(num_data, seed):
     return Data(x, y + NOISE * normal(generator, num_data, 2))
 
 
+def started(data, num_layers=2, kernel="rbf", num_chains=2, num_inducing=10, seed=0):
+    """Where training of chains begins."""
+    model = initial_model(KERNELS[kernel], data, num_layers, num_inducing, num_chains, seeded(seed))
+    return model, sghmc.init(torch.zeros(num_chains, model.num_whitened(), dtype=torch.float64))
+
+
+def chains_of(data, settings, num_burn_in=0, **kind):
+    """The same, to be moved step by step."""
+    model, whitened = started(data, **kind)
+    state = sampler.initial_state(model, whitened, data.num_rows, seeded(1))
+    return Chains(model, state, data, settings, num_burn_in)
+
+
+def mixture_log_likelihood(model, pool, data):
+    """Of the mixture over samples as well as chains."""
+    factorised = factorise_all(model)
+    each = [
+        log_likelihood(
+            model, *propagate(factorised, model.split(positions), data.x.expand(2, -1, -1), seeded(9)), data.y
+        )
+        for positions in pool
+    ]
+    densities = torch.cat(each)
+    return float((densities.logsumexp(0) - math.log(len(densities))).mean())
+
+
+@pytest.mark.usefixtures("unchecked")  # hundreds of steps
 @pytest.mark.parametrize("num_layers", [1, 2])
-def test_training_learns_the_function_and_its_noise(num_layers):
+@pytest.mark.parametrize("hyperparameters", ["sampled", "optimised"])
+def test_training_learns_the_function_and_its_noise(num_layers, hyperparameters):
     data, test = waves(150, 0), waves(400, 1)
-    settings = InferenceSettings(step_size=0.03, learning_rate=0.02, batch_size=100, window_size=50)
-    start = initial_model(KERNELS["matern52"], data, num_layers, 12, seeded())
-    chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
+    settings = InferenceSettings(batch_size=100, hyperparameters=hyperparameters)
+    start, whitened = started(data, num_layers, "matern52", num_inducing=12)
     generator = seeded()
-    trained = train(start, chain, data, 500, generator, settings)
-    samples = mcem.sample(factorise_all(trained.model), trained.chain, data, 20, 5, generator, settings)
-    positions = torch.stack([chain.position for chain in samples])
+    trained = train(start, whitened, data, 500, generator, settings)
+    sampled = training.sample_pool(trained.model, trained.state, data, 10, 5, generator, settings)
 
     # Knowing function and noise exactly would score -log(noise) - 1.42 for each of two targets, on average.
     best = 2 * (-math.log(NOISE) - 0.5 * math.log(2 * math.pi * math.e))
-    before = predictive_log_likelihood(factorise_all(start), chain.position.unsqueeze(0), test, seeded(9))
-    after = predictive_log_likelihood(factorise_all(trained.model), positions, test, seeded(9))
+    before = mixture_log_likelihood(start, whitened.position.unsqueeze(0), test)
+    after = mixture_log_likelihood(trained.model, sampled.pool, test)
     assert before < best - 2.0
     # The mean over 400 test points errs by 2^1/2 / 20; what is not known of the function costs about as much.
     assert best - 0.25 < after < best + 0.2
     # 150 residuals, some ten of them spent on the function, know their variance to 12 %; the last draws of a
-    # stochastic optimiser wander around it by about as much again.
+    # stochastic optimiser, or of a sampler, wander around it by about as much again.
     ratio = trained.model.noise_variance / NOISE**2
     assert ((ratio > 0.5) & (ratio < 1.7)).all()
 
 
-def test_training_moves_every_hyperparameter_and_nothing_it_was_given():
+@pytest.mark.parametrize("num_chains", [1, 2])
+def test_training_moves_every_hyperparameter_and_nothing_it_was_given(num_chains):
     data = waves(30, 0)
-    start = initial_model(KERNELS["rbf"], data, 2, 5, seeded())
+    start, whitened = started(data, num_chains=num_chains, num_inducing=5)
     before = [p.clone() for p in start.parameters()]
-    chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
-    trained = train(start, chain, data, 3, seeded(), InferenceSettings())
+    trained = train(start, whitened, data, 3, seeded(), InferenceSettings(hyperparameters_every=1))
     for kept, given, moved in zip(before, start.parameters(), trained.model.parameters(), strict=True):
         assert torch.equal(kept, given)
-        assert moved.isfinite().all() and not torch.equal(moved, kept) and not moved.requires_grad
-    assert not chain.position.any()
+        assert moved.isfinite().all() and not (moved == kept).any() and not moved.requires_grad
+    assert not whitened.position.any()
+    (latent,) = trained.state.latents
+    assert latent.shape == (num_chains, 30, 1)
+    assert trained.state.num_chains == num_chains
 
 
 @pytest.mark.parametrize("num_data", [1, 3, 40])
 def test_the_same_seed_gives_the_same_result(num_data):
-    data, settings = waves(num_data, 0), InferenceSettings(batch_size=16)
+    data, settings = waves(num_data, 0), InferenceSettings(batch_size=16, hyperparameters_every=1)
     results = []
     for seed in (0, 0, 1):
-        start = initial_model(KERNELS["matern12"], data, 2, 5, seeded(seed))
-        chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
-        results.append(train(start, chain, data, 4, seeded(seed), settings))
+        start, whitened = started(data, kernel="matern12", num_inducing=5, seed=seed)
+        results.append(train(start, whitened, data, 4, seeded(seed), settings))
     first, again, other = results
-    assert first.negative_log_joint == again.negative_log_joint
-    assert all(torch.equal(a, b) for a, b in zip(first.chain, again.chain, strict=True))
-    assert all(torch.equal(a, b) for a, b in zip(first.model.parameters(), again.model.parameters(), strict=True))
-    assert not torch.equal(first.chain.position, other.chain.position)
+    assert first.negative_log_likelihood == again.negative_log_likelihood
+
+    def tensors(trained):
+        state = trained.state
+        return [*state.whitened, *state.parameters, *state.latents, *trained.model.parameters()]
+
+    assert all(torch.equal(a, b) for a, b in zip(tensors(first), tensors(again), strict=True))
+    assert not torch.equal(first.state.whitened.position, other.state.whitened.position)
 
 
 def test_the_window_holds_the_latest_positions_and_no_others():
     """A window that is not yet full is used as far as it goes; one of a single position is the chain's own."""
     data = waves(20, 0)
-    start = initial_model(KERNELS["rbf"], data, 1, 5, seeded())
-    chain = sghmc.init(torch.zeros(start.num_whitened(), dtype=torch.float64))
+    start, whitened = started(data, 1, num_inducing=5)
 
     def lengthscale(window_size):
-        settings = InferenceSettings(step_size=0.1, window_size=window_size)
-        return train(start, chain, data, 6, seeded(), settings).model.layers[0].log_lengthscale
+        settings = InferenceSettings(
+            step_size=0.1, window_size=window_size, hyperparameters="optimised", hyperparameters_every=1
+        )
+        return train(start, whitened, data, 6, seeded(), settings).model.layers[0].log_lengthscale
 
     assert torch.equal(lengthscale(6), lengthscale(600))
     assert not torch.equal(lengthscale(6), lengthscale(1))
 
 
-def started(data, num_layers=2, kernel="rbf"):
-    model = initial_model(KERNELS[kernel], data, num_layers, 10, seeded())
-    return model, sghmc.init(torch.zeros(model.num_whitened(), dtype=torch.float64))
-
-
-def test_hyperparameters_move_as_often_as_asked():
-    data = waves(30, 0)
-    model, chain = started(data)
-    run = mcem.MCEM(model, chain, data, InferenceSettings(hyperparameters_every=3))
+@pytest.mark.parametrize("hyperparameters", ["sampled", "optimised"])
+@pytest.mark.parametrize("num_burn_in", [0, 100])
+def test_hyperparameters_move_as_often_as_asked(hyperparameters, num_burn_in):
+    settings = InferenceSettings(hyperparameters_every=3, hyperparameters=hyperparameters)
+    run = chains_of(waves(30, 0), settings, num_burn_in)
     generator, moved = seeded(), []
     for _ in range(7):
         before = [p.clone() for p in run.model.parameters()]
@@ -107,10 +136,11 @@ def test_hyperparameters_move_as_often_as_asked():
     assert moved == [False, False, True, False, False, True, False]
 
 
-def test_a_snapshot_is_everything_that_a_step_moves():
-    data = waves(30, 0)
-    model, chain = started(data, kernel="matern52")
-    run = mcem.MCEM(model, chain, data, InferenceSettings(window_size=4))
+@pytest.mark.parametrize("hyperparameters", ["sampled", "optimised"])
+@pytest.mark.parametrize("num_burn_in", [0, 5])
+def test_a_snapshot_is_everything_that_a_step_moves(hyperparameters, num_burn_in):
+    settings = InferenceSettings(window_size=4, hyperparameters=hyperparameters, hyperparameters_every=1)
+    run = chains_of(waves(30, 0), settings, num_burn_in, kernel="matern52")
     for _ in range(3):
         run.step(seeded())
     kept = run.snapshot()
@@ -118,18 +148,34 @@ def test_a_snapshot_is_everything_that_a_step_moves():
     for _ in range(2):  # a snapshot survives being restored
         for seed in range(3):
             run.step(seeded(seed))
-        ends.append([p.clone() for p in run.model.parameters()] + [run.chain.position, run.window.clone()])
+        state = run.state
+        latents = [latent.clone() for latent in state.latents]
+        ends.append([*run.model.parameters(), *state.whitened, *state.parameters, *latents, run._window.clone()])
         run.restore(kept)
-        # Restoring brings the chain to rest; for the comparison it moves as it did.
-        run.chain = kept.chain
-        assert run.iteration == 3 and run.settings.step_size == InferenceSettings().step_size
+        # Restoring brings the chains to rest; for the comparison they move as they did.
+        run.state = run.state._replace(whitened=kept.state.whitened, parameters=kept.state.parameters)
+        assert run.iteration == 3 and run.settings == settings and torch.equal(run.value, kept.value)
+        assert all(torch.equal(a, b) for a, b in zip(run.state.latents, kept.state.latents, strict=True))
     assert all(torch.equal(a, b) for a, b in zip(*ends, strict=True))
     run.restore(kept, scale=0.5)
-    assert not run.chain.momentum.any()
-    assert (run.settings.step_size, run.settings.learning_rate) == (0.01, 0.005)
-    assert run._optimiser.param_groups[0]["lr"] == 0.005
+    assert not run.state.whitened.momentum.any() and not run.state.parameters.momentum.any()
+    sizes = (run.settings.step_size, run.settings.hyperparameter_step_size, run.settings.learning_rate)
+    assert sizes == (0.01, 0.03, 0.015)
 
 
+def test_adam_takes_the_smaller_steps_after_a_rollback():
+    settings = InferenceSettings(hyperparameters="optimised", hyperparameters_every=1)
+    run = chains_of(waves(30, 0), settings)
+    kept = run.snapshot()
+    run.restore(kept, scale=0.25)
+    before = run.state.parameters.position.clone()
+    run.step(seeded())
+    # Its first step has the size of the learning rate, here at its end, wherever there is a gradient.
+    step = (run.state.parameters.position - before).abs().max().item()
+    assert step == pytest.approx(0.25 * settings.learning_rate / 6, rel=1e-4)
+
+
+@pytest.mark.usefixtures("unchecked")  # hundreds of steps
 @pytest.mark.parametrize("step_size", [3.0, 10.0])
 def test_a_run_that_diverges_goes_back_and_takes_smaller_steps(step_size):
     """Steps of 10 without exact draws explode at once; what comes out is a usable model all the same.
@@ -139,17 +185,20 @@ def test_a_run_that_diverges_goes_back_and_takes_smaller_steps(step_size):
     """
     data = waves(60, 0)
     settings = InferenceSettings(step_size=step_size, look_every=20, gibbs_every=0)
-    start = mcem.MCEM(*started(data, kernel="matern32"), data, settings).evaluate(seeded())
+    start = chains_of(data, settings, kernel="matern32").evaluate(seeded())
     trained = train(*started(data, kernel="matern32"), data, 200, seeded(), settings)
     assert 1 <= trained.num_rollbacks <= training.MAX_ROLLBACKS
     assert trained.settings.step_size == step_size / 2**trained.num_rollbacks
     assert trained.settings.learning_rate == settings.learning_rate / 2**trained.num_rollbacks
+    smaller = settings.hyperparameter_step_size / 2**trained.num_rollbacks
+    assert trained.settings.hyperparameter_step_size == smaller
     assert trained.num_iterations == 200
-    assert trained.negative_log_joint < start + training.EXPLODED
+    assert trained.negative_log_likelihood < start + training.EXPLODED
     assert all(p.isfinite().all() for p in trained.model.parameters())
-    assert training.is_plausible(trained.chain.position)
+    assert training.is_plausible(trained.state.whitened.position)
 
 
+@pytest.mark.usefixtures("unchecked")  # hundreds of steps
 def test_a_run_that_cannot_be_saved_says_so():
     data = waves(60, 0)
     with pytest.raises(TrainingError, match=r"\b6 times.*\b3\.125\b.*\b60 transitions"):
@@ -157,7 +206,7 @@ def test_a_run_that_cannot_be_saved_says_so():
 
 
 def test_a_covariance_that_cannot_be_factorised_is_gone_back_from(monkeypatch):
-    step, count = mcem.MCEM.step, 0
+    step, count = Chains.step, 0
 
     def stumbling(self, generator):
         nonlocal count
@@ -166,7 +215,7 @@ def test_a_covariance_that_cannot_be_factorised_is_gone_back_from(monkeypatch):
             raise FactorisationError("this one could not")
         step(self, generator)
 
-    monkeypatch.setattr(mcem.MCEM, "step", stumbling)
+    monkeypatch.setattr(Chains, "step", stumbling)
     data = waves(20, 0)
     trained = train(*started(data), data, 40, seeded(), InferenceSettings(look_every=10))
     assert (trained.num_rollbacks, trained.num_iterations) == (1, 40)
@@ -176,12 +225,13 @@ def test_a_covariance_that_cannot_be_factorised_is_gone_back_from(monkeypatch):
 def test_without_trouble_looking_changes_nothing():
     data = waves(30, 0)
     ends = [
-        train(*started(data), data, 30, seeded(), InferenceSettings(look_every=look)).chain.position
+        train(*started(data), data, 30, seeded(), InferenceSettings(look_every=look)).state.whitened.position
         for look in (1, 7, 100)
     ]
     assert torch.equal(ends[0], ends[1]) and torch.equal(ends[0], ends[2])
 
 
+@pytest.mark.usefixtures("unchecked")  # hundreds of steps
 def test_training_stops_when_held_out_data_say_that_it_is_enough():
     data = waves(200, 0)
     settings = InferenceSettings(step_size=0.03, learning_rate=0.03, patience=3, look_every=25)
@@ -189,11 +239,9 @@ def test_training_stops_when_held_out_data_say_that_it_is_enough():
     assert 75 < trained.num_iterations < 1500
     assert trained.num_iterations % 25 == 0
     # It stopped late enough: as good as knowing function and noise, up to what 200 observations leave unknown.
-    pool, *_ = training.sample_pool(
-        factorise_all(trained.model), trained.chain, data, 20, 5, seeded(), trained.settings
-    )
+    sampled = training.sample_pool(trained.model, trained.state, data, 10, 5, seeded(), trained.settings)
     best = 2 * (-math.log(NOISE) - 0.5 * math.log(2 * math.pi * math.e))
-    found = predictive_log_likelihood(factorise_all(trained.model), pool, waves(400, 1), seeded())
+    found = mixture_log_likelihood(trained.model, sampled.pool, waves(400, 1))
     assert best - 0.25 < found < best + 0.2
     # Without patience, or with too little data to judge by, it goes on to the end.
     for rows, patience in ((200, None), (50, 1)):
@@ -217,22 +265,30 @@ def test_held_out_rows_are_not_trained_on():
     assert training._split_off_held_out(few, seeded()) == (few, None)
 
 
+@pytest.mark.usefixtures("unchecked")  # hundreds of steps
 @pytest.mark.parametrize(("num_layers", "gibbs_every"), [(1, 0), (2, 0), (2, 20)])
 def test_sampling_that_diverges_begins_anew_with_smaller_steps(num_layers, gibbs_every):
     data = waves(40, 0)
-    model, chain = started(data, num_layers)
-    # A preconditioner far too large for the curvature: unstable until the step has been halved a few times.
-    wild = chain._replace(square=torch.full_like(chain.square, 1e-2))
-    settings, factorised = InferenceSettings(gibbs_every=gibbs_every, step_size=1.0), factorise_all(model)
-    pool, last, step_size = training.sample_pool(factorised, wild, data, 10, 20, seeded(), settings)
-    assert training.is_plausible(pool) and torch.equal(pool[-1], last.position)
-    assert step_size in [0.5**halvings for halvings in range(1, training.MAX_ROLLBACKS + 1)]
+    model, whitened = started(data, num_layers)
+    # A preconditioner far too large for the curvature: unstable until the step has been halved a few times. Of one
+    # chain: it takes the others along.
+    square = whitened.square.clone()
+    square[1] = 1e-2
+    state = sampler.initial_state(model, whitened._replace(square=square), 40, seeded(1))
+    latents = [latent.clone() for latent in state.latents]
+    settings = InferenceSettings(gibbs_every=gibbs_every, step_size=1.0)
+    told = []
+    sampled = training.sample_pool(model, state, data, 10, 20, seeded(), settings, told.append)
+    assert sampled.pool.shape == (10, 2, model.num_whitened()) and training.is_plausible(sampled.pool)
+    assert torch.equal(sampled.pool[-1], sampled.state.whitened.position)
+    assert sampled.step_size in [0.5**halvings for halvings in range(1, training.MAX_ROLLBACKS + 1)]
+    assert all(torch.equal(a, b) for a, b in zip(latents, state.latents, strict=True)), "each attempt begins anew"
+    assert told[-10:] == list(range(1, 11))
     with pytest.raises(
         TrainingError, match=r"sampling the posterior diverged 6 times, the last time with the step size 31\.25\b"
     ):
-        training.sample_pool(
-            factorised, wild, data, 10, 20, seeded(), InferenceSettings(gibbs_every=gibbs_every, step_size=1e3)
-        )
+        wild = InferenceSettings(gibbs_every=gibbs_every, step_size=1e3)
+        training.sample_pool(model, state, data, 10, 20, seeded(), wild)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e9])
@@ -244,27 +300,37 @@ def test_what_is_absurd_is_not_plausible(value):
 
 
 def test_where_a_run_counts_as_diverged():
-    """Whitened outputs of 1e4, or a negative log joint 1e3 above the lowest; up to there it may recover by itself."""
+    """Whitened outputs of 1e4, or a negative log likelihood 1e3 above the lowest; up to there it may recover.
+
+    Of any chain.
+    """
     positions = torch.zeros(2, 3)
     for largest, plausible in ((9999.5, True), (1e4, False), (-1e4, False)):
         positions[1, 1] = largest
         assert training.is_plausible(positions) is plausible
-    data = waves(20, 0)
-    run = mcem.MCEM(*started(data), data, InferenceSettings())
+    run = chains_of(waves(20, 0), InferenceSettings())
     for value, trouble in ((-4.0, None), (1000.0, None), (1000.5, "1000.5"), (math.nan, "nan")):
-        run.value = torch.tensor(value, dtype=torch.float64)
+        run.value = torch.tensor([-5.0, value], dtype=torch.float64)
         said = training._advance(run, 0, seeded(), best=0.0)
         assert said is None if trouble is None else trouble in said
 
 
+def test_hyperparameters_that_are_absurd_are_gone_back_from():
+    run = chains_of(waves(20, 0), InferenceSettings())
+    run.model.log_noise[1, 0] = 20.0
+    assert "hyperparameter" in training._advance(run, 0, seeded(), best=0.0)
+
+
 def test_the_likelihood_of_a_mixture_is_the_mean_of_its_parts():
-    """log of the mean density over positions, then the mean over the data; one layer propagates without chance."""
+    """log of the mean density over chains, then the mean over the data; one layer propagates without chance."""
     data = waves(15, 0)
-    model, _ = started(data, 1)
+    model, _ = started(data, 1, num_chains=3)
+    model = model.with_parameters([p + 0.2 * normal(seeded(3), *p.shape) for p in model.parameters()])
     factorised, positions = factorise_all(model), normal(seeded(1), 3, model.num_whitened())
-    each = [
-        log_likelihood(model, *propagate(factorised, model.split(v), data.x, seeded()), data.y).exp() for v in positions
-    ]
+    each = []
+    for c, v in enumerate(positions):
+        one = model.with_parameters([parameter[c] for parameter in model.parameters()])
+        each.append(log_likelihood(one, *propagate(factorise_all(one), one.split(v), data.x, seeded()), data.y).exp())
     expected = torch.stack(each).mean(0).log().mean()
     found = predictive_log_likelihood(factorised, positions, data, seeded())
     assert found == pytest.approx(float(expected), rel=1e-12)

@@ -167,7 +167,9 @@ class DeepGPDynamics(Learner[_Fitted]):
             resample_samples=resample_samples,
         )
         if num_features % 2:
-            raise ValueError(f"num_features must be even, a cosine and a sine of each frequency: received {num_features}")
+            raise ValueError(
+                f"num_features must be even, a cosine and a sine of each frequency: received {num_features}"
+            )
         if resample_steps < 0:
             raise ValueError(f"resample_steps must be at least 0, received {resample_steps}")
         if draw not in DRAWS:

@@ -12,11 +12,11 @@ from gym_dgpmpc.dynamics.deep_gp.start import cluster, initial_model, relocate, 
 from gym_dgpmpc.gp.deep_gp import factorise_all, log_likelihood, propagate
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.gp.layer import conditional
-from tests.oracles.models import make_model, normal, seeded
+from tests.oracles.models import chains, make_model, normal, seeded
 
 
 def mean_function(model, whitened, x):
-    """The composition of the layers' means."""
+    """The composition of the layers' means, of one chain or of several."""
     for layer, factor, v in zip(model.layers, factorise_all(model).factors, model.split(whitened), strict=True):
         mean = conditional(layer, factor, v, x)[0]
         x = mean if layer is model.layers[-1] else x + mean
@@ -76,16 +76,19 @@ def test_a_common_stretch_of_the_targets_keeps_the_whole_predictive_law():
 
 @pytest.mark.parametrize("num_layers", [1, 2])
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_relocating_to_the_data_keeps_the_mean_function_there(kernel, num_layers):
+@pytest.mark.parametrize("num_chains", [1, 2])
+def test_relocating_to_the_data_keeps_the_mean_function_there(kernel, num_layers, num_chains):
     """With no more rows than inducing inputs every row is one of them, in every layer: nothing but jitter is lost."""
     generator = seeded(1)
-    model = make_model(num_layers, 2, 2, 15, generator, kernel)
-    whitened = 0.5 * normal(generator, model.num_whitened())
+    model = chains(*(make_model(num_layers, 2, 2, 15, generator, kernel) for _ in range(num_chains)))
+    whitened = 0.5 * normal(generator, num_chains, model.num_whitened())
     data = Data(normal(generator, 12, 2), normal(generator, 12, 2))
     moved, moved_whitened = relocate(model, whitened, data, generator)
-    before, after = (mean_function(m, v, data.x) for m, v in ((model, whitened), (moved, moved_whitened)))
-    torch.testing.assert_close(after, before, rtol=0, atol=5e-3 * before.std().item())
-    assert torch.equal(moved.layers[0].inducing_inputs[:12], data.x)
+    x = data.x.expand(num_chains, -1, -1)
+    before, after = (mean_function(m, v, x) for m, v in ((model, whitened), (moved, moved_whitened)))
+    for one, other in zip(after, before, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=5e-3 * other.std().item())
+    assert torch.equal(moved.layers[0].inducing_inputs[:, :12], x)
     assert moved.log_noise is model.log_noise
     for old, new in zip(model.layers, moved.layers, strict=True):
         assert new.log_variance is old.log_variance and new.log_lengthscale is old.log_lengthscale
@@ -94,13 +97,16 @@ def test_relocating_to_the_data_keeps_the_mean_function_there(kernel, num_layers
 @pytest.mark.parametrize("num_layers", [1, 2])
 def test_relocating_among_more_data_than_inducing_inputs_keeps_a_smooth_function(num_layers):
     generator = seeded(1)
-    model = make_model(num_layers, 2, 1, 40, generator)
-    whitened = 0.5 * normal(generator, model.num_whitened())
+    model = chains(*(make_model(num_layers, 2, 1, 40, generator) for _ in range(2)))
+    whitened = 0.5 * normal(generator, 2, model.num_whitened())
     data = Data(normal(generator, 300, 2), normal(generator, 300, 1))
     moved, moved_whitened = relocate(model, whitened, data, generator)
-    before, after = (mean_function(m, v, data.x) for m, v in ((model, whitened), (moved, moved_whitened)))
-    error = (after - before).square().mean().sqrt()
-    assert error < 0.1 * before.std()
+    x = data.x.expand(2, -1, -1)
+    before, after = (mean_function(m, v, x) for m, v in ((model, whitened), (moved, moved_whitened)))
+    error = (after - before).square().mean((1, 2)).sqrt()
+    assert (error < 0.1 * before.std(dim=(1, 2))).all()
+    # Each chain's centres are its own: those of its own layers' inputs, and of another clustering.
+    assert not torch.equal(*moved.layers[0].inducing_inputs)
 
 
 @pytest.mark.parametrize("num_rows", [1, 4, 7])
@@ -135,15 +141,35 @@ def test_rows_that_are_all_the_same_are_quietly_clustered_and_factorised(num_row
     assert factorise_all(model).factors[0].isfinite().all()
 
 
+def test_restandardising_chains_is_restandardising_each():
+    generator = seeded(1)
+    models = [make_model(2, 3, 2, 6, generator) for _ in range(2)]
+    whitened = normal(generator, 2, models[0].num_whitened())
+    old, new = (
+        tuple(Normaliser(normal(generator, n), 0.5 + normal(generator, n).square()) for n in (3, 2)) for _ in range(2)
+    )
+    together, moved = restandardise(chains(*models), whitened, old, new)
+    for c, model in enumerate(models):
+        alone, alone_moved = restandardise(model, whitened[c], old, new)
+        torch.testing.assert_close(moved[c], alone_moved, rtol=1e-12, atol=1e-12)
+        for a, b in zip(together.parameters(), alone.parameters(), strict=True):
+            torch.testing.assert_close(a[c], b, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("num_chains", [1, 3])
 @pytest.mark.parametrize("num_layers", [1, 3])
-def test_the_initial_model_has_the_published_settings(num_layers):
+def test_the_initial_model_has_the_published_settings(num_layers, num_chains):
     data = Data(normal(seeded(), 30, 4), normal(seeded(1), 30, 2))
-    model = initial_model(KERNELS["matern32"], data, num_layers, 10, seeded(2))
-    assert [round(float(layer.variance), 6) for layer in model.layers] == [0.01] * (num_layers - 1) + [1.0]
-    for layer in model.layers:
+    model = initial_model(KERNELS["matern32"], data, num_layers, 10, num_chains, seeded(2))
+    for index, layer in enumerate(model.layers):
+        variance = 1.0 if index == num_layers - 1 else 0.01
+        torch.testing.assert_close(layer.variance, torch.full((num_chains,), variance, dtype=torch.float64))
         assert layer.kernel is KERNELS["matern32"]
-        assert layer.inducing_inputs.shape == (10, 4)
-        torch.testing.assert_close(layer.lengthscale, torch.full((4,), 2.0, dtype=torch.float64))
+        assert layer.inducing_inputs.shape == (num_chains, 10, 4)
+        torch.testing.assert_close(layer.lengthscale, torch.full((num_chains, 4), 2.0, dtype=torch.float64))
+        centres = layer.inducing_inputs
+        assert torch.equal(centres, model.layers[0].inducing_inputs)
+        assert not any(torch.equal(centres[0], other) for other in centres[1:]), "each chain has its own centres"
     assert len({layer.inducing_inputs.data_ptr() for layer in model.layers}) == num_layers, "each its own"
-    assert model.noise_variance.shape == (2,)
-    torch.testing.assert_close(model.log_noise.exp(), torch.full((2,), 0.05, dtype=torch.float64))
+    assert model.noise_variance.shape == (num_chains, 2)
+    torch.testing.assert_close(model.log_noise.exp(), torch.full((num_chains, 2), 0.05, dtype=torch.float64))
