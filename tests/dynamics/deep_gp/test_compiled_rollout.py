@@ -20,7 +20,7 @@ from gym_dgpmpc.gp.deep_gp import factorise_all
 from gym_dgpmpc.gp.kernels import KERNELS, RBF
 from gym_dgpmpc.planning.rollout import rollout
 from gym_dgpmpc.types import ObservationSpec, TrajectorySampler, Transitions
-from tests.oracles.models import make_model, normal, seeded
+from tests.oracles.models import chains, make_model, normal, seeded
 
 HORIZON, PARTICLES = 6, 3
 SPECS = [
@@ -36,7 +36,10 @@ pytestmark = pytest.mark.skipif(not compiled_rollout.is_available(), reason="no 
 
 
 class Draw:
-    """The same functions, drawn from the same generator, as compiled code and as PyTorch in two precisions."""
+    """The same functions, drawn from the same generator, as compiled code and as PyTorch in two precisions.
+
+    Each particle is of a chain of its own, with hyperparameters and inducing inputs that no other has.
+    """
 
     def __init__(
         self,
@@ -45,7 +48,7 @@ class Draw:
         spec=SPECS[1],
         refresh="step",
         num_inducing=13,
-        num_features=21,
+        num_features=22,
         offset=0.0,
         with_noise=False,
     ):
@@ -58,7 +61,8 @@ class Draw:
         )
         inputs.mean[: len(encoder.plain)] += (torch.zeros(3).double() + offset)[encoder.plain]
         targets.mean.add_(((torch.zeros(3).double() + offset) * (1.0 - encoder.carried))[encoder.predicted])
-        model = make_model(num_layers, encoder.input_size, encoder.target_size, num_inducing, generator)
+        sizes = num_layers, encoder.input_size, encoder.target_size, num_inducing
+        model = chains(*(make_model(*sizes, generator) for _ in range(PARTICLES)))
         names = kernel if isinstance(kernel, tuple) else (kernel,) * num_layers
         layers = zip(model.layers, names, strict=True)
         model = model._replace(layers=tuple(layer._replace(kernel=KERNELS[name]) for layer, name in layers))
@@ -70,7 +74,7 @@ class Draw:
             predicted, centre = torch.zeros(3).double(), normal(generator, 3) + offset
             predicted[encoder.predicted] = 1.0
             blur = ObservationNoise(0.3 * predicted, 0.1 * predicted, centre)
-            noise = torch.full((encoder.target_size,), 0.2).double(), blur
+            noise = 0.1 + 0.1 * torch.rand(PARTICLES, encoder.target_size, generator=generator).double(), blur
 
         def sampler(dtype):
             coordinates = Coordinates(encoder, inputs, targets, dtype)
@@ -87,15 +91,17 @@ class Draw:
 
 
 def errors(draw, actions):
-    """Largest error of compiled and of PyTorch's single precision after one step, against double precision."""
-    exact = rollout(draw.double, draw.observation.double(), actions.double(), PARTICLES)
+    """Largest error of a compiled step and of one by PyTorch in single precision, against double precision.
+
+    All from the same states, those that the compiled steps reached: how chaotic the functions are plays no part, and
+    where states have grown, so has the rounding of both.
+    """
     found = draw.compiled.trajectories(draw.observation, actions)
-    assert found.shape == exact.shape
+    assert found.shape == (HORIZON + 1, PARTICLES, len(actions), 3)
     assert torch.equal(found[0], draw.observation.expand_as(found[0]))
-    by_torch = rollout(draw.single, draw.observation, actions, PARTICLES)
-    # Each compiled step from the state that it reached itself: how chaotic the functions are plays no part.
-    stepped = torch.stack([draw.double(found[t].double(), actions[:, t].double(), t) for t in range(HORIZON)])
-    return (found[1:] - stepped).abs().max(), (by_torch[1] - exact[1]).abs().max()
+    exact = torch.stack([draw.double(found[t].double(), actions[:, t].double(), t) for t in range(HORIZON)])
+    by_torch = torch.stack([draw.single(found[t].clone(), actions[:, t], t) for t in range(HORIZON)])
+    return (found[1:] - exact).abs().max(), (by_torch - exact).abs().max()
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -132,7 +138,7 @@ def test_far_from_the_inducing_inputs_and_on_them(kernel):
     """Vanishing kernels, many turns of the features and angles, and distances of exactly zero."""
     draw = Draw(kernel, 1, ObservationSpec())
     scale = draw.single.layers[0].inverse_lengthscale
-    centre = draw.single.layers[0].centres[:, 0] / scale  # some multiple of the first inducing input
+    centre = (draw.single.layers[0].centres[..., 0] / scale)[1]  # some multiple of a particle's first inducing input
     for observation in (torch.full((3,), 40.0), torch.zeros(3), centre[:3]):
         draw.observation = observation
         compiled, by_torch = errors(draw, draw.actions(5))
@@ -140,12 +146,29 @@ def test_far_from_the_inducing_inputs_and_on_them(kernel):
         assert compiled < max(10 * by_torch, 1e-6 * observation.abs().max(), 1e-5)
 
 
-@pytest.mark.parametrize(("num_inducing", "num_features"), [(16, 32), (16, 21), (13, 32), (1, 1)])
+@pytest.mark.parametrize(("num_inducing", "num_features"), [(16, 32), (16, 22), (13, 32), (1, 2)])
 def test_inducing_inputs_and_features_may_fill_their_blocks_or_not(num_inducing, num_features):
     """Blocks are of 8: what is padded computes nothing, and nothing beyond it is read."""
     draw = Draw("matern32", 2, num_inducing=num_inducing, num_features=num_features)
     compiled, by_torch = errors(draw, draw.actions(7))
     assert compiled < max(10 * by_torch, 1e-5)
+
+
+@pytest.mark.parametrize("num_inducing", [13, 16])
+def test_every_particle_has_a_model_of_its_own(num_inducing):
+    """With other hyperparameters and inducing inputs of one particle the others roll out as before, bit by bit."""
+    draw = Draw("matern32", 2, num_inducing=num_inducing)
+    actions = draw.actions(5)
+    before = draw.compiled.trajectories(draw.observation, actions)
+    for name in ("inverse_lengthscale", "centres", "offsets", "frequencies"):
+        layers = []
+        for layer in draw.compiled.layers:
+            changed = getattr(layer, name).clone()
+            changed[1] *= 1.1
+            layers.append(layer._replace(**{name: changed}))
+        after = compiled_rollout.CompiledRollout(layers, draw.compiled.coordinates)(draw.observation, actions)
+        assert torch.equal(after[:, [0, 2]], before[:, [0, 2]])
+        assert (after[1:, 1] - before[1:, 1]).abs().amax() > 1e-4, name
 
 
 def test_every_layer_may_have_a_kernel_of_its_own():
@@ -173,7 +196,14 @@ def test_a_kernel_that_the_compiled_code_does_not_have_is_left_to_pytorch(monkey
     worlds = []
     for kernel, compile in (("own", True), ("rbf", False), ("own", False), ("own", True)):
         model = DeepGPDynamics(
-            3, 2, kernel=kernel, num_inducing=5, first_training_iterations=2, num_samples=2, compile=compile
+            3,
+            2,
+            kernel=kernel,
+            num_inducing=5,
+            first_training_iterations=2,
+            num_samples=2,
+            num_chains=2,
+            compile=compile,
         )
         model.fit(Transitions(observation, observation[:, :2], observation), seeded())
         with warnings.catch_warnings(record=True) as caught:
@@ -315,7 +345,8 @@ def test_the_model_draws_compiled_worlds_and_plans_alike_without(refresh, add_no
             num_inducing=20,
             num_features=32,
             first_training_iterations=20,
-            num_samples=5,
+            num_samples=4,
+            num_chains=2,
             refresh=refresh,
             add_noise=add_noise,
             compile=compile,
@@ -328,7 +359,9 @@ def test_the_model_draws_compiled_worlds_and_plans_alike_without(refresh, add_no
 
 
 def test_double_precision_is_rolled_out_by_pytorch():
-    model = DeepGPDynamics(3, 2, num_inducing=5, first_training_iterations=2, num_samples=2, dtype=torch.float64)
+    model = DeepGPDynamics(
+        3, 2, num_inducing=5, first_training_iterations=2, num_samples=2, num_chains=1, dtype=torch.float64
+    )
     observation = normal(seeded(), 10, 3).float()
     model.fit(Transitions(observation, observation[:, :2], observation), seeded())
     assert not isinstance(model.draw(2, 3, seeded()), TrajectorySampler)

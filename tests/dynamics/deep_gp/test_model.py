@@ -8,15 +8,15 @@ import torch
 from gym_dgpmpc.dynamics.deep_gp import start as deep_gp_start
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.errors import TrainingError
-from gym_dgpmpc.inference.mcem import InferenceSettings
+from gym_dgpmpc.inference.sampler import InferenceSettings
 from gym_dgpmpc.planning.rollout import rollout
 from gym_dgpmpc.types import DynamicsModel, ObservationSpec, Transitions
 from tests.oracles import pendulum
 from tests.oracles.models import seeded
 
 TINY = {
-    "num_inducing": 8, "num_features": 16, "first_training_iterations": 3, "training_iterations": 2, "num_samples": 4,
-    "sample_spacing": 1, "resample_steps": 2,
+    "num_inducing": 8, "num_features": 16, "first_training_iterations": 3, "training_iterations": 2, "num_chains": 2,
+    "num_samples": 8, "sample_spacing": 1, "resample_steps": 2,
 }  # fmt: skip
 
 
@@ -45,7 +45,7 @@ def test_it_is_a_dynamics_model():
 def test_fit_draw_and_roll_out(draw, num_layers):
     model = tiny(draw=draw, num_layers=num_layers)
     metrics = model.fit(pendulum.simulate(30), seeded())
-    assert {"negative_log_joint", "effective_sample_size", "gradient_norm", "noise_std", "r_hat"} <= set(metrics)
+    assert {"negative_log_likelihood", "effective_sample_size", "gradient_norm", "noise_std", "r_hat"} <= set(metrics)
     assert all(isinstance(value, float) and value == value for value in metrics.values())
     states = predictions(model)
     assert states.shape == (5, 3, 6, 2) and states.dtype == torch.float32 and states.isfinite().all()
@@ -111,24 +111,62 @@ def test_an_unfitted_model_says_so(verb):
             tiny().resample(pendulum.simulate(3), seeded())
 
 
+@pytest.mark.parametrize("num_chains", [1, 2, 3])
 @pytest.mark.parametrize("gibbs_every", [20, 0])
-def test_resampling_replaces_the_oldest_rows_of_the_pool_and_nothing_else(gibbs_every):
+def test_resampling_replaces_the_oldest_rows_of_the_pool_and_nothing_else(gibbs_every, num_chains):
+    """Of one chain, of all in turn."""
     num = 3 if gibbs_every else 1  # SG-HMC alone gives one position
-    model, generator = fitted(num_samples=4, resample_samples=3, gibbs_every=gibbs_every), seeded(3)
+    settings = {"num_chains": num_chains, "num_samples": 4 * num_chains, "resample_samples": 3}
+    model, generator = fitted(**settings, gibbs_every=gibbs_every), seeded(3)
     before = {name: torch.as_tensor(value).clone() for name, value in model.state_dict().items()}
-    pool, oldest = before["pool"], 0
-    for count in range(1, 6):  # around the ring of four and further
+    oldest = [0] * num_chains
+    for count in range(1, 3 * num_chains + 3):  # around the rings of four and further
+        chain = (count - 1) % num_chains
         model.resample(pendulum.simulate(30 + count), generator)
         state = model.state_dict()
-        changed = (state["pool"] != pool).any(dim=1).nonzero().flatten().tolist()
-        assert changed == sorted((oldest + i) % 4 for i in range(num))
-        newest = (oldest + num - 1) % 4
-        oldest = (oldest + num) % 4
-        assert state["oldest"] == oldest
-        assert torch.equal(state["pool"][newest], state["chain.position"])
-        pool = state["pool"].clone()
+        changed = (state["pool"] != before["pool"]).any(dim=2).nonzero().tolist()
+        assert changed == [[row, chain] for row in sorted((oldest[chain] + i) % 4 for i in range(num))]
+        newest = (oldest[chain] + num - 1) % 4
+        oldest[chain] = (oldest[chain] + num) % 4
+        assert (state["oldest"], state["turn"]) == (oldest[-1], count % num_chains)
+        assert torch.equal(state["pool"][newest, chain], state["chain.position"][chain])
         moved = {name for name, value in before.items() if not torch.equal(torch.as_tensor(state[name]), value)}
-        assert moved - {"oldest"} == {"pool", "chain.position", "chain.momentum"}
+        assert moved - {"oldest", "turn"} == {"pool", "chain.position", "chain.momentum", "latents.0"}
+        others = [other for other in range(num_chains) if other != chain]
+        for name in ("chain.position", "chain.momentum"):
+            assert torch.equal(state[name][others], before[name][others])
+        # New rows have latents of every chain; those of the old rows are moved of the one that goes on.
+        latents, known = state["latents.0"], before["latents.0"]
+        assert latents.shape == (num_chains, 30 + count, 4) and latents.dtype == torch.float32
+        assert torch.equal(latents[others, : known.shape[1]], known[others])
+        before = {name: torch.as_tensor(value).clone() for name, value in state.items()}
+
+
+@pytest.mark.parametrize(("num_samples", "num_chains", "kept"), [(4, 2, 2), (5, 2, 3), (1, 3, 1), (7, 1, 7)])
+def test_the_pool_has_as_many_samples_of_each_chain(num_samples, num_chains, kept):
+    model = fitted(num_samples=num_samples, num_chains=num_chains)
+    state = model.state_dict()
+    assert state["pool"].shape == (kept, num_chains, 48)
+    assert state["layers.0.log_variance"].shape == (num_chains,)
+    assert torch.equal(state["pool"][-1], state["chain.position"])
+
+
+def test_particles_are_spread_over_the_chains_and_then_over_their_samples():
+    """Of 3 chains with 4 samples each: any 3 are of 3 chains, any 12 are all samples, and it begins anew."""
+    model = fitted(num_chains=3, num_samples=12)
+    firsts = set()
+    for seed in range(30):
+        chain, row = model._pick(30, seeded(seed))
+        assert chain.dtype == row.dtype == torch.int64 and len(chain) == len(row) == 30
+        for start in range(0, 30, 3):
+            assert sorted(chain[start : start + 3].tolist()) == [0, 1, 2]
+        pairs = list(zip(chain.tolist(), row.tolist(), strict=True))
+        assert len(set(pairs[:12])) == len(set(pairs[12:24])) == 12
+        for count in (1, 2, 7):
+            few = model._pick(count, seeded(seed))
+            assert len(few[0]) == len(few[1]) == count and len(set(few[0].tolist())) == min(count, 3)
+        firsts |= set(pairs[:3])
+    assert len(firsts) == 12, "none is preferred"
 
 
 def test_resampling_may_be_turned_off():
@@ -148,22 +186,44 @@ def test_a_state_that_was_taken_does_not_change_with_the_model():
 
 
 def test_particles_are_distinct_samples_while_the_pool_lasts():
-    model = fitted(num_layers=1, num_inducing=4, num_features=1, refresh="plan")
-    pool = torch.arange(4.0, dtype=torch.float64).unsqueeze(1).expand(4, 8)
-    model.load_state_dict(model.state_dict() | {"pool": 100.0 * (1.0 + pool)})
-    sampler = model.draw(6, 1, seeded())
-    # Samples a hundred standard deviations apart tell which particle holds which.
+    model = fitted(num_layers=1, num_inducing=4, num_features=2, refresh="plan")
+    # 4 rows of 2 chains: the samples are 100, 200, ... in the first one, 500, 600, ... in the second.
+    pool = 100.0 * (1.0 + torch.arange(8.0, dtype=torch.float64).view(2, 4).mT.unsqueeze(-1).expand(4, 2, 8))
+    # One set of hyperparameters: the size of a sample shows as it is.
     state = model.state_dict()
-    raw = state["layers.0.inducing_inputs"] * state["inputs.std"] + state["inputs.mean"]
+    alike = {
+        name: value[:1].expand_as(value)
+        for name, value in state.items()
+        if name.startswith("layers.") or name == "log_noise"
+    }
+    model.load_state_dict(state | alike | {"pool": pool})
+    sampler = model.draw(10, 1, seeded())
+    # Samples a hundred standard deviations apart tell which particle holds which.
+    raw = alike["layers.0.inducing_inputs"][0] * state["inputs.std"] + state["inputs.mean"]
     angle, rate, action = torch.atan2(raw[:, 1], raw[:, 2]), raw[:, 0], raw[:, 3:]
     observation = torch.stack([angle, rate], 1).float()
-    change = sampler(observation.expand(6, -1, -1).clone(), action.float(), 0)[:, :, 1] - observation[:, 1]
+    change = sampler(observation.expand(10, -1, -1).clone(), action.float(), 0)[:, :, 1] - observation[:, 1]
     held = change.abs().mean(1)
-    order = held.argsort()
-    assert torch.allclose(held[:2], held[4:], rtol=0.1), "the fifth particle begins the pool again"
-    assert sorted(order[order < 4].tolist()) == [0, 1, 2, 3]
-    steps = held[:4].sort().values
-    assert torch.allclose(steps / steps[0], torch.tensor([1.0, 2.0, 3.0, 4.0]), rtol=0.1)
+    steps = held[:8].sort().values
+    assert torch.allclose(steps / steps[0], torch.arange(1.0, 9.0), rtol=0.1)
+    assert all(min(abs(first / again - 1) for first in held[:8]) < 0.1 for again in held[8:]), "the pool begins again"
+    low = held < 4.5 * steps[0]
+    assert (low[::2] != low[1::2]).all(), "neighbours are of different chains"
+
+
+def test_each_particle_has_the_hyperparameters_of_its_chain():
+    """A chain with a vanishing kernel predicts no change, whatever its samples are."""
+    model = fitted(num_layers=1)
+    state = model.state_dict()
+    flat = torch.stack([state["layers.0.log_variance"][0], torch.tensor(-40.0, dtype=torch.float64)])
+    centred = {"targets.mean": torch.zeros_like(state["targets.mean"])}
+    model.load_state_dict(state | centred | {"layers.0.log_variance": flat})
+    for draw in ("pathwise", "joint", "marginal"):
+        model.draw_kind = draw
+        chain, _ = model._pick(6, seeded(5))
+        change = predictions(model, num_particles=6, horizon=1)[1] - predictions(model, num_particles=6, horizon=1)[0]
+        still = change.abs().amax((1, 2)) < 1e-5
+        assert torch.equal(still, chain == 1)
 
 
 @pytest.mark.parametrize("draw", ["pathwise", "joint", "marginal"])
@@ -194,9 +254,10 @@ def test_an_unfitted_model_saves_and_loads_too():
 @pytest.mark.parametrize(
     ("settings", "name", "expected", "received"),
     [
-        ({"num_inducing": 9}, "layers.0.inducing_inputs", (9, 4), (8, 4)),
-        ({"num_layers": 3}, "layers.2.inducing_inputs", (8, 4), None),
-        ({"num_samples": 5}, "pool", (5, 48), (4, 48)),
+        ({"num_inducing": 9}, "layers.0.inducing_inputs", (2, 9, 4), (2, 8, 4)),
+        ({"num_layers": 3}, "layers.2.inducing_inputs", (2, 8, 4), None),
+        ({"num_samples": 10}, "pool", (5, 2, 48), (4, 2, 48)),
+        ({"num_chains": 4}, "layers.0.inducing_inputs", (4, 8, 4), (2, 8, 4)),
     ],
 )
 def test_the_state_of_another_model_is_refused(settings, name, expected, received):
@@ -208,7 +269,9 @@ def test_the_state_of_another_model_is_refused(settings, name, expected, receive
     assert torch.equal(predictions(model), before)
 
 
-@pytest.mark.parametrize("name", ["pool", "oldest", "log_noise", "inputs.std", "chain.square", "layers.1.log_variance"])
+@pytest.mark.parametrize(
+    "name", ["pool", "oldest", "turn", "log_noise", "inputs.std", "chain.square", "layers.1.log_variance", "latents.0"]
+)
 @pytest.mark.parametrize("value", [None, "text", torch.zeros(3, 3)])
 def test_a_missing_or_damaged_entry_is_named(name, value):
     state = dict(fitted().state_dict())
@@ -217,6 +280,22 @@ def test_a_missing_or_damaged_entry_is_named(name, value):
         del state[name]
     with pytest.raises(ValueError, match=f"'{name}'"):
         tiny().load_state_dict(state)
+
+
+@pytest.mark.parametrize("turn", [-1, 2])
+def test_a_chain_that_there_is_not_is_refused(turn):
+    with pytest.raises(ValueError, match=rf"'turn'.*\b1\b.* {turn}$"):
+        tiny().load_state_dict(fitted().state_dict() | {"turn": turn})
+
+
+def test_a_state_without_latents_of_its_rows_has_them_drawn():
+    """As those of earlier versions are: latents of no rows."""
+    model = fitted()
+    state = model.state_dict()
+    model.load_state_dict(state | {"latents.0": state["latents.0"][:, :0]})
+    assert torch.equal(predictions(model), predictions(fitted()))
+    model.resample(pendulum.simulate(31), seeded())
+    assert model.state_dict()["latents.0"].shape == (2, 31, 4)
 
 
 @pytest.mark.parametrize("oldest", [-1, 4])
@@ -231,6 +310,8 @@ def test_a_position_outside_the_ring_is_refused(oldest):
         ({"num_layers": 0}, "num_layers .* 0$"),
         ({"num_inducing": 0}, "num_inducing .* 0$"),
         ({"num_features": -1}, "num_features .* -1$"),
+        ({"num_features": 7}, "num_features .* 7$"),
+        ({"num_chains": 0}, "num_chains .* 0$"),
         ({"first_training_iterations": 0}, "first_training_iterations .* 0$"),
         ({"training_iterations": 0}, "training_iterations .* 0$"),
         ({"num_samples": 0}, "num_samples .* 0$"),
@@ -244,6 +325,8 @@ def test_a_position_outside_the_ring_is_refused(oldest):
         ({"learning_rate": float("nan")}, "learning_rate .* nan$"),
         ({"decay": 1.5}, r"decay .* 1\.5$"),
         ({"gibbs_every": -1}, "gibbs_every .* -1$"),
+        ({"hyperparameter_step_size": 0.0}, r"hyperparameter_step_size .* 0\.0$"),
+        ({"hyperparameters": "fixed"}, "hyperparameters 'fixed'.*sampled, optimised"),
         ({"draw": "thompson"}, "draw 'thompson'.*pathwise, joint, marginal"),
         ({"refresh": "never"}, "refresh 'never'.*step, plan"),
         ({"kernel": "cubic"}, "kernel 'cubic'.*rbf"),
@@ -257,6 +340,7 @@ def test_settings_out_of_range_are_named(settings, message):
 
 def test_settings_of_inference_are_settings_of_the_model():
     given = {"step_size": 0.03, "decay": 0.1, "window_size": 7, "patience": 3, "look_every": 11}
+    given |= {"hyperparameters": "optimised", "hyperparameter_step_size": 0.01}
     assert tiny(**given).inference == InferenceSettings(**given)
     assert tiny().inference == InferenceSettings()
     with pytest.raises(TypeError, match="'stepsize'"):
@@ -276,22 +360,22 @@ def test_a_training_that_diverges_leaves_the_model_as_it_was():
 @pytest.mark.parametrize("gibbs_every", [20, 0])
 def test_a_resampling_that_diverges_is_dropped(gibbs_every):
     model = fitted(gibbs_every=gibbs_every, resample_steps=50)
-    before, step_size = predictions(model), model._fitted.step_size
+    before, step_size = predictions(model, num_particles=8), model._fitted.step_size
     model._fitted = model._fitted._replace(step_size=1e4)
     assert model.resample(pendulum.simulate(31), seeded()) == {"resamplings_dropped": 1.0}
-    assert torch.equal(predictions(model), before)
+    assert torch.equal(predictions(model, num_particles=8), before)
     model._fitted = model._fitted._replace(step_size=step_size)
     assert model.resample(pendulum.simulate(31), seeded()) == {"resamplings_dropped": 0.0}
-    assert not torch.equal(predictions(model), before)
+    assert not torch.equal(predictions(model, num_particles=8), before)
 
 
 def test_resampling_takes_the_steps_that_training_had_to_make_smaller():
     """Those asked for diverge each time, and the pool would stay as it is for a whole episode."""
-    settings = {"step_size": 8.0, "first_training_iterations": 300, "resample_steps": 10}
+    settings = {"step_size": 32.0, "first_training_iterations": 300, "resample_steps": 10}
     model = tiny(**settings)
     metrics = model.fit(pendulum.simulate(40), seeded())
     assert metrics["rollbacks"] >= 1
-    assert model.state_dict()["step_size"] <= 8.0 / 2 ** metrics["rollbacks"]
+    assert model.state_dict()["step_size"] <= 32.0 / 2 ** metrics["rollbacks"]
     loaded = tiny(**settings)
     loaded.load_state_dict(model.state_dict())
     for each in (model, loaded):
@@ -330,4 +414,5 @@ def test_clustering_looks_at_a_bounded_number_of_rows(monkeypatch):
     monkeypatch.setattr(deep_gp_start, "cluster", lambda x, *rest: sizes.append(len(x)) or cluster(x, *rest))
     model = fitted(40)
     model.fit(pendulum.simulate(60), seeded())
-    assert sizes == [25, 25, 25]
+    # Of both chains at the start, and then in both layers.
+    assert sizes == [25] * 6
