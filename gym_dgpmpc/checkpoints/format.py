@@ -28,7 +28,7 @@ from gym_dgpmpc.errors import CheckpointError, CheckpointWriteError
 from gym_dgpmpc.types import StateDict
 
 FORMAT = "gym_dgpmpc agent"
-SCHEMA = 5
+SCHEMA = 6
 """`upgrade.py` has the older ones. A field that is added needs no new number: its noun reads older files."""
 
 CheckpointPath = str | os.PathLike[str] | IO[bytes] | io.BufferedIOBase

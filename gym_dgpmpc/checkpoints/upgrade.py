@@ -1,8 +1,9 @@
 """Files of older schemas as the present one has them; called where a file is read, so that nothing else knows of them.
 
 1: without what a running episode needs to go on. 2: of one environment, whose reward was not learned. 3: with the
-episodes that logged means are over as plain values. 4: with the state of all nouns in one part, "agent". Each lacks
-arguments that came later; `arguments.saved_arguments` gives those the constructor's defaults, whatever the schema.
+episodes that logged means are over as plain values. 4: with the state of all nouns in one part, "agent". 5: with one
+chain of a deep Gaussian process, whose hyperparameters were optimised. Each lacks arguments that came later;
+`arguments.saved_arguments` gives those the constructor's defaults, whatever the schema.
 """
 
 from typing import Any
@@ -13,19 +14,54 @@ from torch import Tensor
 MOST_MISSING = 10
 """A table of the summaries of episodes may have this many times the numbers that a file holds of them."""
 SPACES = ("observation_space", "action_space")
+ONE_CHAIN = {"num_chains": 1, "hyperparameters": "optimised"}
+"""Arguments that make a deep Gaussian process what it was up to schema 5."""
+OLD_DEFAULTS = {"window_size": 100, "hyperparameters_every": 1, "learning_rate": 0.01}
+"""Defaults of that time, of arguments that a file may lack."""
 
 Config = dict[str, Any]
 Tensors = dict[str, dict[str, Tensor]]
 
 
 def upgraded(config: Config, tensors: Tensors, schema: int) -> tuple[Config, Tensors]:
-    """A file's contents in the layout of schema 5.
+    """A file's contents in the layout of schema 6.
 
     Raises:
         KeyError, TypeError, ValueError, AttributeError: the contents are not those of the schema.
     """
-    if schema >= 5:
+    if schema < 5:
+        config, tensors = _by_noun(config, tensors, schema)
+    return _with_chains(config, tensors) if schema < 6 else (config, tensors)
+
+
+def _with_chains(config: Config, tensors: Tensors) -> tuple[Config, Tensors]:
+    """Schema 5 as 6: chains are a leading axis of what a deep Gaussian process holds, of the pool the second."""
+    arguments, held = config.get("arguments"), tensors["dynamics"]
+    if isinstance(arguments, dict) and "sample_spacing" in arguments:  # which the deep Gaussian process alone has
+        num_features = arguments.get("num_features")
+        # Features are pairs now; which they are is drawn anew for each plan, so one more is no other agent.
+        even = {"num_features": num_features + num_features % 2} if isinstance(num_features, int) else {}
+        config = config | {"arguments": OLD_DEFAULTS | arguments | even | ONE_CHAIN}
+    if "chain.position" not in held:
         return config, tensors
+    of_chain = [name for name in held if name == "log_noise" or name.startswith(("chain.", "layers."))]
+    upgraded = held | {name: held[name].unsqueeze(0) for name in of_chain} | {"pool": held["pool"].unsqueeze(1)}
+    # The latents of inner layers were not kept: those of no rows, which the model completes when it needs them.
+    layers = [name for name in held if name.startswith("layers.") and name.endswith(".inducing_inputs")]
+    for index in range(len(layers) - 1):
+        shape = 1, 0, held["layers.0.inducing_inputs"].shape[1]
+        upgraded[f"latents.{index}"] = torch.zeros(shape, dtype=torch.float32, device="cpu")
+    values = config["values"]
+    values = values | {"dynamics": values["dynamics"] | {"turn": 0}}
+    return config | {"values": values}, tensors | {"dynamics": upgraded}
+
+
+def _by_noun(config: Config, tensors: Tensors, schema: int) -> tuple[Config, Tensors]:
+    """Schemas 1 to 4 as 5: a part for each noun.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError: the contents are not those of the schema.
+    """
     own = tensors["agent"]
     episodes, episode_values = _episodes(config, own, schema)
     logs, log_values = _logs(config, own, schema)
