@@ -320,7 +320,7 @@ class Chains:
             gradient = gradient + prior / num_data
         gradient = -gradient
         if sampled and self.iteration > self._num_burn_in:
-            # Its preconditioner goes on adapting: where Adam ended gradients vanish, and would allow far too large steps.
+            # Its preconditioner goes on adapting: where Adam ended gradients vanish, which would make steps far too long.
             parameters = sghmc.step(
                 parameters,
                 gradient,

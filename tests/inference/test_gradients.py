@@ -71,9 +71,7 @@ def test_one_layer_has_the_gradient_of_the_closed_form_posterior(kernel):
         away = (by_layer[0][chain] - posterior.mean).mT.unsqueeze(-1)
         # That of the likelihood alone: the prior's is -v.
         expected = -(precision @ away).squeeze(-1).mT + by_layer[0][chain]
-        torch.testing.assert_close(
-            found.whitened[chain].view(expected.shape), expected / len(y), rtol=1e-7, atol=1e-9
-        )
+        torch.testing.assert_close(found.whitened[chain].view(expected.shape), expected / len(y), rtol=1e-7, atol=1e-9)
 
 
 def test_what_the_first_layer_saw_may_be_given():
