@@ -11,10 +11,14 @@ from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.dynamics.noise import NoiseSplit, split_noise
+from gym_dgpmpc.dynamics.predictive import Mixture, Predictive
 from gym_dgpmpc.forks import compute_on_one_thread_in_children
 from gym_dgpmpc.types import ObservationSpec, ProgressFn, Transitions
 
 Fitted = TypeVar("Fitted")
+
+ROWS_AT_ONCE = 1000
+"""Transitions that `predictive` looks at together, so that memory stays small."""
 
 
 class Learner(Generic[Fitted]):
@@ -116,6 +120,30 @@ class Learner(Generic[Fitted]):
     ) -> dict[str, float]:
         """Both parts of the noise, in units of the targets' standardisation; nothing where they are not told apart."""
         return {} if found is None else found.metrics(variance.double() * targets.std.square(), targets.std)
+
+    @torch.no_grad()
+    def predictive(self, data: Transitions, generator: torch.Generator) -> Predictive:
+        """What the model expects after these observations and actions, its noise included, whatever draws leave out.
+
+        Args:
+            data: transitions, raw units; their next observations serve for ``log_density`` alone.
+            generator: of posterior samples, where the model has any.
+
+        Raises:
+            RuntimeError: the model was not fitted.
+            ValueError: there are no transitions.
+        """
+        self._require_fit("predict")
+        x, y = self._encode(data)
+        by_rows = [
+            self._mixture(rows, generator).predictive(target)
+            for rows, target in zip(x.split(ROWS_AT_ONCE), y.split(ROWS_AT_ONCE), strict=True)
+        ]
+        return Predictive(*(torch.cat(parts) for parts in zip(*by_rows, strict=True)))
+
+    def _mixture(self, x: Float[Tensor, "n D"], generator: torch.Generator) -> Mixture:
+        """The predictive density of the targets, both in raw units, float64."""
+        raise NotImplementedError
 
     def _require_fit(self, verb: str) -> Fitted:
         if self._fitted is None:

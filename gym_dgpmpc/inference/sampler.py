@@ -86,7 +86,7 @@ class InferenceSettings:
     step_size: float = 0.02
     decay: float = 0.05
     hyperparameters: Hyperparameters = "sampled"
-    hyperparameter_step_size: float = 0.06
+    hyperparameter_step_size: float = 0.02
     learning_rate: float = 0.03
     hyperparameters_every: int = 4
     window_size: int = 1
@@ -180,7 +180,7 @@ class Chains:
         self._optimiser = torch.optim.Adam([self._flat], lr=settings.learning_rate)
         self._optimiser.state[self._flat] = adam_memory(self._flat)
         self._window = self._flat.new_empty(settings.window_size, *state.whitened.position.shape)
-        self.iteration = 0
+        self.iteration, self._cooling = 0, 1.0
         self.value = self._flat.new_zeros(state.num_chains)
         """The last negative log likelihood per observation, on a minibatch, of each chain."""
         self._refactorise()
@@ -215,13 +215,14 @@ class Chains:
         batch, index = self._batch(settings.batch_size, generator)
         passed, latents = self._pass(state.whitened.position, batch, index, generator, move=self.iteration % 2 == 0)
         self.value = -likelihood(self.factorised, passed, batch.y).mean(-1)
+        self._cooling = cooling(batch.num_rows, num_data)
         current = self._gradients(state.whitened.position, passed, latents, batch, of_parameters=moves_parameters)
         whitened = sghmc.step(
             state.whitened,
             state.whitened.position / num_data - current.whitened,
             num_data,
             generator,
-            step_size=settings.step_size,
+            step_size=self._cooling * settings.step_size,
             decay=settings.decay,
             burn_in=self.iteration < self._num_burn_in,
         )
@@ -320,13 +321,13 @@ class Chains:
             gradient = gradient + prior / num_data
         gradient = -gradient
         if sampled and self.iteration > self._num_burn_in:
-            # Its preconditioner goes on adapting: where Adam ended gradients vanish, and would allow far too large steps.
+            # Its preconditioner goes on adapting: where Adam ended gradients vanish, which would make steps far too long.
             parameters = sghmc.step(
                 parameters,
                 gradient,
                 num_data,
                 generator,
-                step_size=settings.hyperparameter_step_size,
+                step_size=self._cooling * settings.hyperparameter_step_size,
                 decay=settings.decay,
                 burn_in=True,
             )
@@ -364,6 +365,15 @@ class Chains:
         names = ("step_size", "hyperparameter_step_size", "learning_rate")
         self.settings = replace(self.settings, **{name: scale * getattr(self.settings, name) for name in names})
         self._refactorise()
+
+
+def cooling(batch_size: int, num_data: int) -> float:
+    """What a step size is multiplied by where gradients are those of minibatches.
+
+    With M^-1 = 1 / sd(g) the noise of such a gradient adds eps^2 N sd(g) / 2 m times the variance that SG-HMC injects
+    (eps^4 M^-2 var(g) to 2 eps^2 m M^-1 / N). With eps in proportion to N^-1/2 that share does not grow with the data.
+    """
+    return min(1.0, (batch_size / num_data) ** 0.5)
 
 
 class Snapshot(NamedTuple):

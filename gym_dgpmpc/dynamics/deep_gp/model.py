@@ -1,8 +1,8 @@
 """The paper's dynamics model: a deep Gaussian process over transitions, sampled by SG-HMC.
 
 Prepares data for `inference/`, keeps what it returns (for each of some chains hyperparameters, where it is, and a pool
-of posterior samples), and makes the draws of `draws.py` from the pool: each particle is of another chain. The agent calls `fit` at an episode's start, `resample` after each control step
-and `draw` for each plan.
+of posterior samples), and makes the draws of `draws.py` from the pool: each particle is of another chain. The agent
+calls `fit` at an episode's start, `resample` after each control step and `draw` for each plan.
 """
 
 import math
@@ -33,9 +33,10 @@ from gym_dgpmpc.dynamics.deep_gp.draws import (
 from gym_dgpmpc.dynamics.deep_gp.start import initial_model, relocate, restandardise
 from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.noise import NoiseSplit, observed, take_noise_split
+from gym_dgpmpc.dynamics.predictive import Mixture
 from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.errors import FactorisationError
-from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all, posterior_mean
+from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all, posterior_mean, propagate
 from gym_dgpmpc.gp.kernels import Kernel, find_kernel
 from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.inference import sghmc, training
@@ -95,10 +96,10 @@ class DeepGPDynamics(Learner[_Fitted]):
         first_training_iterations: training iterations of the first fit, of one SG-HMC step each; every few of them move
             the hyperparameters.
         training_iterations: training iterations of each later fit, which goes on from the fit before.
-        num_chains: chains of the sampler, C, with hyperparameters and inducing inputs of their own; particles are spread
-            over them.
-        num_samples: posterior samples kept (the pool), over all chains, and rounded up to as many of each; the worlds of
-            a plan are drawn from them.
+        num_chains: chains of the sampler, C, with hyperparameters and inducing inputs of their own; particles are
+            spread over them.
+        num_samples: posterior samples kept (the pool), over all chains, rounded up to as many of each; the worlds of a
+            plan are drawn from them.
         sample_spacing: SG-HMC steps between two samples of the pool; more of them make the samples less alike.
         resample_steps: SG-HMC steps of one chain after each control step, of the chains in turn, by which the posterior
             follows the new data; 0 keeps the posterior as it is within an episode.
@@ -322,6 +323,20 @@ class DeepGPDynamics(Learner[_Fitted]):
         joint = self.draw_kind == "joint"
         sampler = ConditionalSampler(posterior, coordinates, generator, joint=joint, noise_std=process_std)
         return observed(sampler, blur, generator)
+
+    def _mixture(self, x: Float[Tensor, "n D"], generator: torch.Generator) -> Mixture:
+        """Over all samples of the pool, with one draw through the inner layers for each."""
+        fitted = self._require_fit("predict")
+        inputs, targets = fitted.normalisers
+        model, whitened = fitted.factorised.model, fitted.factorised.model.split(fitted.pool)
+        moments = []
+        for row in range(self._samples_of_chain):
+            points = inputs(x).expand(self.num_chains, -1, -1)
+            moments.append(propagate(fitted.factorised, [v[row] for v in whitened], points, generator))
+        mean, variance = (torch.cat(parts) for parts in zip(*moments, strict=True))
+        noise = model.noise_variance.repeat(self._samples_of_chain, 1).unsqueeze(1)
+        variance = variance.unsqueeze(-1) + noise
+        return Mixture(targets.inverse(mean), variance * targets.std.square())
 
     def _pick(self, num_particles: int, generator: torch.Generator) -> tuple[Int[Tensor, "P"], Int[Tensor, "P"]]:
         """A chain and a row of the pool for each particle, as different as may be."""

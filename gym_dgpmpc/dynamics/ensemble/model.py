@@ -29,6 +29,7 @@ from gym_dgpmpc.dynamics.ensemble.network import (
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.noise import NoiseSplit, observed, take_noise_split
+from gym_dgpmpc.dynamics.predictive import Mixture
 from gym_dgpmpc.dynamics.state import take_normaliser, take_tensors
 from gym_dgpmpc.inference.adam import adam_memory
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
@@ -217,6 +218,12 @@ class EnsembleDynamics(Learner[_Fitted]):
         collapsed, match_moments = CollapsedEnsemble(network, share), self.draw_kind == "MM"
         sampler = GaussianSampler(collapsed, coordinates, generator, match_moments=match_moments)
         return observed(sampler, blur, generator)
+
+    def _mixture(self, x: Float[Tensor, "n D"], generator: torch.Generator) -> Mixture:
+        fitted = self._require_fit("predict")
+        rows = fitted.inputs(x).float().expand(self.num_members, -1, -1)
+        mean, logvar = predict(fitted.network, rows)
+        return Mixture(mean.double(), logvar.double().exp())
 
     def state_dict(self) -> StateDict:
         """Networks, input normaliser and what Adam remembers; empty before the first fit."""

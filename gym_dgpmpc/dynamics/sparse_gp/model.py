@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Literal, NamedTuple, get_args
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from gym_dgpmpc.checks import check_counts
@@ -20,6 +21,7 @@ from gym_dgpmpc.dynamics.deep_gp.start import restandardise
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner
 from gym_dgpmpc.dynamics.noise import NoiseSplit, observed, take_noise_split
+from gym_dgpmpc.dynamics.predictive import Mixture
 from gym_dgpmpc.dynamics.sparse_gp.moment_matching import MomentMatchingSampler
 from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.gp.deep_gp import DeepGP
@@ -179,6 +181,12 @@ class SparseGPDynamics(Learner[_Fitted]):
         coordinates = Coordinates(self.encoder, *normalisers, self.dtype)
         sampler = GaussianSampler(predict, coordinates, generator, match_moments=self.draw_kind == "MM")
         return observed(sampler, drawn.observation(self.encoder), generator)
+
+    def _mixture(self, x: Float[Tensor, "n D"], generator: torch.Generator) -> Mixture:
+        model, (inputs, targets), posterior, _ = self._require_fit("predict")
+        mean, variance = sparse_predict(model.layers[0], model.noise_variance, posterior, inputs(x))
+        variance = (variance + model.noise_variance) * targets.std.square()
+        return Mixture(targets.inverse(mean).unsqueeze(0), variance.unsqueeze(0))
 
     def state_dict(self) -> StateDict:
         """Hyperparameters, normalisers and the posterior; empty before the first fit."""

@@ -1,0 +1,78 @@
+"""How well models know what they do not know, on recorded episodes: `python -m benchmarks.calibration`.
+
+Every model is trained on 1, 2 and 4 episodes of a learning run, and forecasts 1 to 40 steps of episodes that it has not
+seen, on the run's policy and off it. Writes `calibration.json`, one row for each seed, and `calibration.md`, the means
+over seeds; what is in the former already is not measured again.
+"""
+
+import argparse
+import json
+import time
+from collections import defaultdict
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+import torch
+
+from benchmarks import RESULTS
+from benchmarks.calibration.episodes import DATA, SEEDS, TASKS
+from benchmarks.calibration.measure import TESTED_AFTER, measure
+from benchmarks.calibration.models import MODELS
+from benchmarks.report import markdown
+from benchmarks.rows import command
+from gym_dgpmpc.checkpoints.files import replace_text
+
+SCORES = ("coverage_50", "coverage_90", "coverage_95", "nll", "crps", "rmse", "z2")
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Means over seeds, with the standard error of the likelihood's."""
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        groups[tuple(row[key] for key in ("task", "episodes", "test", "horizon", "model"))].append(row)
+    cells = []
+    for key, group in groups.items():
+        means = {score: fmean(row[score] for row in group) for score in SCORES}
+        error = stdev([row["nll"] for row in group]) / len(group) ** 0.5 if len(group) > 1 else float("nan")
+        shown = [f"{means[score]:.3f}" if score in ("crps", "rmse") else f"{means[score]:.2f}" for score in SCORES]
+        shown[SCORES.index("nll")] += f" ± {error:.2f}"
+        cells.append([*map(str, key), str(len(group)), *shown])
+    names = ["task", "episodes", "test", "steps", "model", "seeds", *SCORES]
+    commands = ", ".join(f"`{each}`" for each in dict.fromkeys(row["command"] for row in rows))
+    return "\n".join([f"Made by {commands}.", "", *markdown.table(names, cells)]) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.calibration", description=__doc__)
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=list(TASKS))
+    parser.add_argument("--models", nargs="+", default=list(MODELS), choices=list(MODELS), metavar="MODEL")
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument("--episodes", nargs="+", type=int, default=list(TESTED_AFTER))
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--results", type=Path, default=RESULTS / "calibration")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    file = arguments.results / "calibration.json"
+    rows: list[dict[str, Any]] = json.loads(file.read_text())["rows"] if file.exists() else []
+    about = {"command": command("calibration"), "torch": torch.__version__}
+    for seed in arguments.seeds:
+        for task in arguments.tasks:
+            for name in arguments.models:
+                done = {
+                    row["episodes"] for row in rows if (row["task"], row["seed"], row["model"]) == (task, seed, name)
+                }
+                if done >= set(arguments.episodes):
+                    continue
+                started = time.time()
+                found = measure(MODELS[name], task, seed, tuple(arguments.episodes), arguments.data)
+                rows += [{"model": name} | row | about for row in found]
+                arguments.results.mkdir(parents=True, exist_ok=True)
+                replace_text(file, json.dumps({"rows": rows}, indent=1) + "\n")
+                replace_text(arguments.results / "calibration.md", table(rows))
+                print(f"{task}, seed {seed}, {name}: {time.time() - started:.0f} s", flush=True)
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
