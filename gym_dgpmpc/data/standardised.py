@@ -1,11 +1,10 @@
-"""Standardised inputs and targets, as the models train on them, and minibatches of them.
+"""Standardised inputs and targets, as the models train on them.
 
 Between `normaliser.py`, which makes them, and what trains: `inference/` and `dynamics/`.
 """
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -34,15 +33,3 @@ class DataSource(Protocol):
     def num_rows(self) -> int: ...
 
     def rows(self, index: Int[Tensor, "n"]) -> Data: ...
-
-
-def minibatch(data: DataSource, size: int, generator: torch.Generator) -> Data:
-    """``size`` rows drawn uniformly with replacement; everything if there are no more than that."""
-    num_rows = data.num_rows
-    if num_rows <= size:
-        return (
-            data
-            if isinstance(data, Data)
-            else data.rows(torch.arange(num_rows, dtype=torch.int64, device=generator.device))
-        )
-    return data.rows(torch.randint(num_rows, (size,), generator=generator, device=generator.device))

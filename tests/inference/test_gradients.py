@@ -79,12 +79,14 @@ def test_what_the_first_layer_saw_may_be_given():
     terms, by_layer = layer_terms(factorise_all(model)), model.split(whitened)
     passed = forward(terms, by_layer, x.expand(2, -1, -1), latents)
     again = forward(terms, by_layer, x.expand(2, -1, -1), latents, passed[0].seen)
-    assert all(torch.equal(a.mean, b.mean) and torch.equal(a.variance, b.variance) for a, b in zip(passed, again))
+    assert all(
+        torch.equal(a.mean, b.mean) and torch.equal(a.variance, b.variance) for a, b in zip(passed, again, strict=True)
+    )
 
 
 def test_points_may_be_taken():
     """Some points pass as they do among others, of each chain its own."""
-    model, whitened, x, y, latents = problem(3)
+    model, whitened, x, _, latents = problem(3)
     factorised, by_layer = factorise_all(model), model.split(whitened)
     terms = layer_terms(factorised)
     passed = forward(terms, by_layer, x.expand(2, -1, -1), latents)

@@ -204,6 +204,15 @@ def uncertain(model):
     return model._replace(layers=(inner, last), log_noise=torch.full_like(model.log_noise, math.log(0.02)))
 
 
+@pytest.mark.parametrize(("batch_size", "share"), [(8, 0.2), (50, 0.5), (200, 1.0), (1000, 1.0)])
+def test_steps_shrink_with_the_root_of_the_share_of_the_data_in_a_minibatch(batch_size, share, seen_gradients):
+    models, data = one_layer(num_data=200)
+    settings = InferenceSettings(batch_size=batch_size, hyperparameters_every=1, step_size=0.1)
+    started(models, data, settings).step(seeded())
+    sizes = [kwargs["step_size"] for *_, kwargs in seen_gradients]
+    assert sizes == pytest.approx([share * 0.1, share * settings.hyperparameter_step_size], rel=1e-12)
+
+
 def test_a_datums_latents_settle_in_their_conditional_law():
     """Against quadrature over the one latent of a datum; 3000 rows that are the same are as many independent chains.
 

@@ -200,7 +200,7 @@ class PathwiseSampler:
 
     @cached_property
     def _in_weights(self) -> list[tuple[Tensor, Tensor]]:
-        """Each layer's maps from (x, |x|^2, 1) to the kernel's argument "P D+2 M" and the features' phases "P D+2 F"."""
+        """Each layer's maps from (x, |x|^2, 1) to the kernel's argument "P D+2 M" and features' phases "P D+2 F"."""
         weights = []
         for layer in self.layers:
             square = torch.full_like(layer.offsets, layer.kernel.argument_scale)
