@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 
 import torch
+from gym_dgpmpc.inference.mcem import MCEM
 
 from benchmarks.rows import Row
 from benchmarks.speed import floor, peers
@@ -33,7 +34,6 @@ from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.dynamics.deep_gp.start import initial_model
 from gym_dgpmpc.gp.deep_gp import factorise_all
 from gym_dgpmpc.inference import mcem, sghmc
-from gym_dgpmpc.inference.mcem import MCEM
 from gym_dgpmpc.planning.rollout import particle_returns, rollout
 
 NUM_TRANSITIONS = 600
