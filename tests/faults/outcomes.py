@@ -40,6 +40,8 @@ ONCE_WRONG = (
     World(action="vast float64"),
     World(action="beyond float32"),
     World(action="all fixed"),
+    World(action="all fixed", wrappers=("RescaleAction",), reward_fn="right"),
+    World(action="vast float64", wrappers=("RescaleAction",), reward_fn="right"),
     World(terminated_fn="a number", given_terminated="never"),
     World(reward_fn="right", vec_wrapper="VecCheckNan", num_envs=2),
     World(observation_spec="beyond", agent="still"),
@@ -137,6 +139,13 @@ def must_refuse(world: World, recorder: Recorder) -> bool | None:
         return True
     if offers and world.reward_fn in ("right", "mixes precision") and set(ACTION_CHANGERS) & set(world.wrappers):
         return True
+    bounds = [name for name in world.wrappers if name.startswith("RescaleAction") or name.endswith("a wide one")]
+    rescales = bool(bounds) and bounds[0].startswith("RescaleAction")  # the environment's own bounds
+    if offers and world.reward_fn in ("right", "mixes precision") and rescales:
+        inner = recorder.unwrapped.action_space
+        with np.errstate(over="ignore"):
+            if (inner.low == inner.high).any() or not np.isfinite(inner.high.astype(np.float32)).all():
+                return True  # Gymnasium's wrapper makes NaN or infinity of actions
     if world.observation_spec == "beyond":
         return True
     if world.observation_spec in ("plain", "angle") and set(OBSERVATION_CHANGERS) & set(world.wrappers):
@@ -416,5 +425,5 @@ def run_worlds(number):
     try:
         check()
     except Exception as error:
-        return dict(counts), [f"{type(error).__name__}: {error}"]
+        return dict(counts), ["\n".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])]
     return dict(counts), []
