@@ -224,14 +224,14 @@ def test_sampling_that_diverges_begins_anew_with_smaller_steps(num_layers, gibbs
     # A preconditioner far too large for the curvature: unstable until the step has been halved a few times.
     wild = chain._replace(square=torch.full_like(chain.square, 1e-2))
     settings, factorised = InferenceSettings(gibbs_every=gibbs_every, step_size=1.0), factorise_all(model)
-    pool, last, step_size = training.sample_pool(factorised, wild, data, 10, 20, seeded(), settings)
+    pool, last, step_size = training.sample_pool(factorised, wild, data, 5, 20, seeded(), settings)
     assert training.is_plausible(pool) and torch.equal(pool[-1], last.position)
     assert step_size in [0.5**halvings for halvings in range(1, training.MAX_ROLLBACKS + 1)]
     with pytest.raises(
         TrainingError, match=r"sampling the posterior diverged 6 times, the last time with the step size 31\.25\b"
     ):
         training.sample_pool(
-            factorised, wild, data, 10, 20, seeded(), InferenceSettings(gibbs_every=gibbs_every, step_size=1e3)
+            factorised, wild, data, 5, 20, seeded(), InferenceSettings(gibbs_every=gibbs_every, step_size=1e3)
         )
 
 
