@@ -4,19 +4,17 @@ Either exactly what it returned is in the store, and the agent predicts, is save
 before any step; or one that names the step, where only a step shows what is wrong, and all steps before it are kept.
 """
 
-import collections
 import io
 import traceback
-import warnings
 
 import numpy as np
 import torch
 from gymnasium import spaces
-from hypothesis import HealthCheck, Phase, given, settings
 
 from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 from gym_dgpmpc.tasks.reward_guard import disagreements
+from tests.faults.generated import count_outcomes
 from tests.faults.worlds import (
     BAD_REWARD_FNS,
     BAD_TERMINATED_FNS,
@@ -403,27 +401,5 @@ def as_arrays(observation, space):
 
 
 def run_worlds(number):
-    """({outcome: count}, the smallest world found that went wrong, as texts)."""
-    counts = collections.Counter()
-
-    @settings(
-        max_examples=number,
-        deadline=None,
-        database=None,
-        derandomize=True,
-        suppress_health_check=list(HealthCheck),
-        phases=(Phase.generate, Phase.shrink),
-        report_multiple_bugs=False,
-    )
-    @given(worlds())
-    def check(world):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            counts[outcome(world)] += 1
-
-    torch.set_num_threads(1)
-    try:
-        check()
-    except Exception as error:
-        return dict(counts), ["\n".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])]
-    return dict(counts), []
+    """See `count_outcomes`."""
+    return count_outcomes(worlds(), outcome, number)
