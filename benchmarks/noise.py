@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from benchmarks import RESULTS
+from benchmarks.calibration import score
 from benchmarks.rows import Row, measure_missing
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
@@ -41,7 +41,6 @@ SETTINGS.add_argument("--steps", type=int, default=220)
 SETTINGS.add_argument("--gain", type=float, default=1.0, help="of the action")
 
 DECAY, HORIZONS, TEST_SEEDS = 0.9, (1, 5, 10, 20), range(5000, 5004)
-NUM_PARTICLES, NORMAL_90 = 100, 1.645
 
 
 def episode(steps: int, gain: float, process_std: float, observation_std: float, seed: int) -> Transitions:
@@ -56,18 +55,8 @@ def episode(steps: int, gain: float, process_std: float, observation_std: float,
 
 
 def coverage(model: DynamicsModel, tests: list[Transitions], generator: torch.Generator) -> dict[int, float]:
-    """How often what is observed after H steps lies in the 90 % interval (Gaussian in the particles' moments)."""
-    covered: dict[int, list[Tensor]] = {horizon: [] for horizon in HORIZONS}
-    for test in tests:
-        start = torch.arange(0, len(test.action) - max(HORIZONS), 5)
-        sampler = model.draw(NUM_PARTICLES, max(HORIZONS), generator)
-        state = test.observation[start].expand(NUM_PARTICLES, -1, -1).contiguous()
-        for step in range(max(HORIZONS)):
-            state = sampler(state, test.action[start + step], step)
-            if step + 1 in covered:
-                error = (test.next_observation[start + step] - state.mean(0)).abs()
-                covered[step + 1].append((error < NORMAL_90 * state.std(0)).float().mean())
-    return {horizon: float(torch.stack(shares).mean()) for horizon, shares in covered.items()}
+    """How often what is observed after H steps lies in the 90 % interval; see `score`."""
+    return {horizon: score(model, tests, horizon, generator)["coverage_90"] for horizon in HORIZONS}
 
 
 def measure(wanted: Row) -> Row:

@@ -101,6 +101,7 @@ def of_chosen(reward_fn: RewardFn, changing: Sequence[Any]) -> RewardFn:
 
     Raises:
         ChangingActionsError: one of them does more than to map actions, or maps the same action now so and now so.
+        ValueError: they make an action that is not finite, as rescaling to bounds that are equal does.
     """
     if not changing:
         return reward_fn
@@ -118,8 +119,15 @@ def of_chosen(reward_fn: RewardFn, changing: Sequence[Any]) -> RewardFn:
         backwards = performed.of_rows(rows[::-1])[::-1]
     except Exception as error:
         raise ChangingActionsError(f"{names} (which raised {type(error).__name__}: {error})") from error
-    if not np.array_equal(one_by_one, backwards):
+    if not np.array_equal(one_by_one, backwards, equal_nan=True):
         raise ChangingActionsError(names)
+    with np.errstate(over="ignore"):
+        lost = ~np.isfinite(one_by_one.astype(np.float32)).all(axis=1)
+    if lost.any():
+        raise ValueError(
+            f"the wrappers {names} make the action {one_by_one[lost][0]} of {rows[lost][0]}, which is not finite in "
+            "float32: the bounds between which they rescale must differ, and not be vast"
+        )
     together = PerformedActions(performed.maps, space, takes_batches=True)
     try:
         is_exact = np.array_equal(together.of_rows(rows), one_by_one)

@@ -39,8 +39,8 @@ class FlatDict(VecEnvWrapper):
 
     def __init__(self, venv: VecEnv):
         space = venv.observation_space
+        assert isinstance(space, spaces.Dict), f"FlatDict is for Dict observations, got {space}"
         check_dict_space(space)
-        assert isinstance(space, spaces.Dict)
         self.dict_space = space
         boxes = [space[key] for key in sorted(space.spaces)]
         low, high = (np.concatenate([getattr(box, name) for box in boxes]) for name in ("low", "high"))
@@ -61,13 +61,12 @@ class FlatDict(VecEnvWrapper):
         return flatten(observation), rewards, dones, flat_infos
 
 
-def check_dict_space(space: spaces.Space) -> None:
+def check_dict_space(space: spaces.Dict) -> None:
     """Refuse a Dict of which no vector of real numbers can be made.
 
     Raises:
         ValueError: it has no parts, or one is not a one-dimensional Box of floats.
     """
-    assert isinstance(space, spaces.Dict), f"expected a Dict of observations, got {space}"
     if not space.spaces:
         raise ValueError(f"a Dict observation space must have at least one part, got {space}")
     for key, part in space.items():

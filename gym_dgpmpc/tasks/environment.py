@@ -106,14 +106,13 @@ def check_observation_space(space: spaces.Space) -> None:
         ValueError: they are none.
     """
     if isinstance(space, spaces.Dict):
-        return check_dict_space(space)
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1 or space.dtype.kind != "f" or not flat_size(space):
+        check_dict_space(space)
+    elif not isinstance(space, spaces.Box) or len(space.shape) != 1 or space.dtype.kind != "f" or not flat_size(space):
         raise ValueError(
             "the dynamics model learns vectors of one or more real numbers: the observation space must be a "
             f"one-dimensional Box of floats, or a Dict of such, got {space}. {_how_to_make_floats(space)}; images are "
             "not supported"
         )
-    return None
 
 
 def _how_to_make_floats(space: spaces.Space) -> str:

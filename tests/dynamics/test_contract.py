@@ -110,6 +110,12 @@ def learner(request):
     return request.param
 
 
+@pytest.fixture(params={CASES[name].family: name for name in LEARNERS}.values())
+def trainer(request):
+    """One learner of each family: how it draws does not change its training."""
+    return request.param
+
+
 def test_it_is_a_dynamics_model(name):
     model = CASES[name].make()
     assert isinstance(model, DynamicsModel)
@@ -336,8 +342,8 @@ def test_with_one_member_it_does_not_matter_when_it_is_chosen():
     assert torch.equal(states_of(every_step, num_particles=7), states_of(once, num_particles=7))
 
 
-def test_a_training_that_says_how_far_it_is_is_the_same(learner):
-    silent, told = CASES[learner].make(), CASES[learner].make()
+def test_a_training_that_says_how_far_it_is_is_the_same(trainer):
+    silent, told = CASES[trainer].make(), CASES[trainer].make()
     heard = []
     told.on_progress = lambda *progress: heard.append(progress)
     data = slider.transitions(NUM_DATA, NOISE)
@@ -425,12 +431,12 @@ def test_what_was_told_apart_is_kept_and_older_states_have_none_of_it(learner):
         model.load_state_dict({key: value for key, value in model.state_dict().items() if key != "noise.centre"})
 
 
-def test_a_training_says_how_much_noise_of_each_kind_it_found(learner):
+def test_a_training_says_how_much_noise_of_each_kind_it_found(trainer):
     """Where it is asked to tell them apart; these transitions do not follow one another, so all is the process's."""
     data = slider.transitions(40, NOISE)
-    silent, asked = CASES[learner].make(add_noise=False), CASES[learner].make(add_noise=True, split_noise=True)
+    silent, asked = CASES[trainer].make(add_noise=False), CASES[trainer].make(add_noise=True, split_noise=True)
     for model in (silent, asked):
-        model.load_state_dict(trained_state(CASES[learner].family))
+        model.load_state_dict(trained_state(CASES[trainer].family))
     metrics, more = silent.fit(data, seeded()), asked.fit(data, seeded())
     assert more.items() >= metrics.items(), "the training is the same"
     assert set(more) - set(metrics) == {"process_noise_std", "observation_noise_std"}

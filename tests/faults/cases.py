@@ -3,20 +3,18 @@
 An environment returns what a case says, whatever it is asked to do; an agent learns in it and predicts.
 """
 
-import warnings
 from typing import NamedTuple
 
 import gymnasium
 import hypothesis.strategies as st
 import numpy as np
-import torch
 from gymnasium import spaces
-from hypothesis import HealthCheck, Phase, given, settings
 
 from gym_dgpmpc import DGPMPCAgent
 from gym_dgpmpc.dynamics.deep_gp.draws import DRAWS, REFRESHES
 from gym_dgpmpc.errors import DGPMPCError
 from gym_dgpmpc.gp.kernels import KERNELS
+from tests.faults.generated import count_outcomes
 
 STEPS = 8
 
@@ -160,28 +158,5 @@ def outcome(case):
 
 
 def run_cases(number):
-    """({outcome: count}, the smallest case found that went wrong, as texts)."""
-    counts = {}
-
-    @settings(
-        max_examples=number,
-        deadline=None,
-        database=None,
-        derandomize=True,
-        suppress_health_check=list(HealthCheck),
-        phases=(Phase.generate, Phase.shrink),
-        report_multiple_bugs=False,
-    )
-    @given(cases())
-    def check(case):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            found = outcome(case)
-        counts[found] = counts.get(found, 0) + 1
-
-    torch.set_num_threads(1)
-    try:
-        check()
-    except Exception as error:
-        return counts, [f"{type(error).__name__}: {error}"]
-    return counts, []
+    """See `count_outcomes`."""
+    return count_outcomes(cases(), outcome, number)

@@ -4,19 +4,17 @@ Either exactly what it returned is in the store, and the agent predicts, is save
 before any step; or one that names the step, where only a step shows what is wrong, and all steps before it are kept.
 """
 
-import collections
 import io
 import traceback
-import warnings
 
 import numpy as np
 import torch
 from gymnasium import spaces
-from hypothesis import HealthCheck, Phase, given, settings
 
 from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 from gym_dgpmpc.tasks.reward_guard import disagreements
+from tests.faults.generated import count_outcomes
 from tests.faults.worlds import (
     BAD_REWARD_FNS,
     BAD_TERMINATED_FNS,
@@ -40,6 +38,8 @@ ONCE_WRONG = (
     World(action="vast float64"),
     World(action="beyond float32"),
     World(action="all fixed"),
+    World(action="all fixed", wrappers=("RescaleAction",), reward_fn="right"),
+    World(action="vast float64", wrappers=("RescaleAction",), reward_fn="right"),
     World(terminated_fn="a number", given_terminated="never"),
     World(reward_fn="right", vec_wrapper="VecCheckNan", num_envs=2),
     World(observation_spec="beyond", agent="still"),
@@ -137,6 +137,13 @@ def must_refuse(world: World, recorder: Recorder) -> bool | None:
         return True
     if offers and world.reward_fn in ("right", "mixes precision") and set(ACTION_CHANGERS) & set(world.wrappers):
         return True
+    bounds = [name for name in world.wrappers if name.startswith("RescaleAction") or name.endswith("a wide one")]
+    rescales = bool(bounds) and bounds[0].startswith("RescaleAction")  # the environment's own bounds
+    if offers and world.reward_fn in ("right", "mixes precision") and rescales:
+        inner = recorder.unwrapped.action_space
+        with np.errstate(over="ignore"):
+            if (inner.low == inner.high).any() or not np.isfinite(inner.high.astype(np.float32)).all():
+                return True  # Gymnasium's wrapper makes NaN or infinity of actions
     if world.observation_spec == "beyond":
         return True
     if world.observation_spec in ("plain", "angle") and set(OBSERVATION_CHANGERS) & set(world.wrappers):
@@ -394,27 +401,5 @@ def as_arrays(observation, space):
 
 
 def run_worlds(number):
-    """({outcome: count}, the smallest world found that went wrong, as texts)."""
-    counts = collections.Counter()
-
-    @settings(
-        max_examples=number,
-        deadline=None,
-        database=None,
-        derandomize=True,
-        suppress_health_check=list(HealthCheck),
-        phases=(Phase.generate, Phase.shrink),
-        report_multiple_bugs=False,
-    )
-    @given(worlds())
-    def check(world):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            counts[outcome(world)] += 1
-
-    torch.set_num_threads(1)
-    try:
-        check()
-    except Exception as error:
-        return dict(counts), [f"{type(error).__name__}: {error}"]
-    return dict(counts), []
+    """See `count_outcomes`."""
+    return count_outcomes(worlds(), outcome, number)
