@@ -41,7 +41,10 @@ def _with_chains(config: Config, tensors: Tensors) -> tuple[Config, Tensors]:
         num_features = arguments.get("num_features")
         # Features are pairs now; which they are is drawn anew for each plan, so one more is no other agent.
         even = {"num_features": num_features + num_features % 2} if isinstance(num_features, int) else {}
-        config = config | {"arguments": OLD_DEFAULTS | arguments | even | ONE_CHAIN}
+        arguments = OLD_DEFAULTS | arguments | even | ONE_CHAIN
+        if arguments.pop("resample_steps", 1) == 0:  # now there are exact draws in their place
+            arguments["resample_samples"] = 0
+        config = config | {"arguments": arguments}
     if "chain.position" not in held:
         return config, tensors
     of_chain = [name for name in held if name == "log_noise" or name.startswith(("chain.", "layers."))]
@@ -51,9 +54,7 @@ def _with_chains(config: Config, tensors: Tensors) -> tuple[Config, Tensors]:
     for index in range(len(layers) - 1):
         shape = 1, 0, held["layers.0.inducing_inputs"].shape[1]
         upgraded[f"latents.{index}"] = torch.zeros(shape, dtype=torch.float32, device="cpu")
-    values = config["values"]
-    values = values | {"dynamics": values["dynamics"] | {"turn": 0}}
-    return config | {"values": values}, tensors | {"dynamics": upgraded}
+    return config, tensors | {"dynamics": upgraded}
 
 
 def _by_noun(config: Config, tensors: Tensors, schema: int) -> tuple[Config, Tensors]:

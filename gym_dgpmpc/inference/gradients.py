@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gym_dgpmpc.gp.deep_gp import Factorised, log_likelihood
@@ -93,25 +93,28 @@ def moments(terms: LayerTerms, whitened: Float[Tensor, "C M O"], seen: Seen, lea
     return Passed(seen, mean, variance.clamp_min(least))
 
 
+def pass_first(terms: Sequence[LayerTerms], whitened: Float[Tensor, "C M O"], seen: Seen) -> Passed:
+    """The points through the first of these layers, which may be the last."""
+    return moments(terms[0], whitened, seen, 0.0 if len(terms) == 1 else LEAST_VARIANCE)
+
+
 def forward(
     terms: Sequence[LayerTerms],
     whitened: Sequence[Tensor],
     x: Float[Tensor, "C n D"],
     latents: Sequence[Float[Tensor, "C n D"]],
-    first: Seen | None = None,
+    first: Passed | None = None,
 ) -> list[Passed]:
     """The points through all layers.
 
     Args:
         latents: e_l of each inner layer.
-        first: what the first layer sees of ``x``, if that is known already.
+        first: how ``x`` passes the first layer, if that is known already.
     """
-    passed, last = [], len(terms) - 1
-    for index, (layer, v) in enumerate(zip(terms, whitened, strict=True)):
-        seen = first if index == 0 and first is not None else see(layer, x)
-        passed.append(moments(layer, v, seen, 0.0 if index == last else LEAST_VARIANCE))
-        if index != last:
-            x = x + passed[-1].mean + passed[-1].variance.sqrt().unsqueeze(-1) * latents[index]
+    passed = [first or pass_first(terms, whitened[0], see(terms[0], x))]
+    for index, (layer, v) in enumerate(zip(terms[1:], whitened[1:], strict=True), 1):
+        x = x + passed[-1].mean + passed[-1].variance.sqrt().unsqueeze(-1) * latents[index - 1]
+        passed.append(moments(layer, v, see(layer, x), 0.0 if index == len(terms) - 1 else LEAST_VARIANCE))
     return passed
 
 
@@ -120,18 +123,16 @@ def likelihood(factorised: Factorised, passed: Sequence[Passed], y: Float[Tensor
     return log_likelihood(factorised.model, passed[-1].mean, passed[-1].variance, y)
 
 
-def take(values: Float[Tensor, "C m *o"], rows: Int[Tensor, "C n"]) -> Float[Tensor, "C n *o"]:
-    """Some of each chain's points."""
-    index = rows.unsqueeze(-1).expand(-1, -1, values.shape[-1]) if values.ndim == 3 else rows
-    return values.gather(1, index)
-
-
-def take_passed(passed: Passed, rows: Int[Tensor, "C n"]) -> Passed:
-    """Some of each chain's points, as they passed a layer."""
-    seen = passed.seen
-    projected = seen.projected.gather(2, rows.unsqueeze(1).expand(-1, seen.projected.shape[1], -1))
-    seen = Seen(take(seen.scaled, rows), projected, take(seen.slope, rows))
-    return Passed(seen, take(passed.mean, rows), take(passed.variance, rows))
+def choose(first_one: Bool[Tensor, "C n"], one: Passed, other: Passed) -> Passed:
+    """Each point as it passed a layer one way or the other."""
+    by_row, by_column = first_one.unsqueeze(-1), first_one.unsqueeze(1)
+    seen = Seen(
+        torch.where(by_row, one.seen.scaled, other.seen.scaled),
+        torch.where(by_column, one.seen.projected, other.seen.projected),
+        torch.where(by_row, one.seen.slope, other.seen.slope),
+    )
+    variance = torch.where(first_one, one.variance, other.variance)
+    return Passed(seen, torch.where(by_row, one.mean, other.mean), variance)
 
 
 def gradients(

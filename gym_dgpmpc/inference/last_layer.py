@@ -31,28 +31,50 @@ class LastLayerPosterior(NamedTuple):
         spread = torch.linalg.solve_triangular(self.precision_factor.mT, noise, upper=True)
         return (self.mean.unsqueeze(-1) + spread).permute(3, 0, 2, 1)
 
+    def positions(
+        self, inner: Float[Tensor, "C I"], num_samples: int, generator: torch.Generator
+    ) -> Float[Tensor, "n C V"]:
+        """Draws behind the inner layers' inducing outputs, which they share."""
+        drawn = self.sample(num_samples, generator).flatten(-2)
+        return torch.cat([inner.expand(num_samples, -1, -1), drawn], dim=-1)
 
-def last_layer_posterior(
+
+class LastLayerEvidence(NamedTuple):
+    """What data say of v_L: of independent data the sum of what each says."""
+
+    precision: Float[Tensor, "C T M M"]
+    moment: Float[Tensor, "C T M"]
+
+    def plus(self, other: "LastLayerEvidence") -> "LastLayerEvidence":
+        """Of both data."""
+        return LastLayerEvidence(self.precision + other.precision, self.moment + other.moment)
+
+    def posterior(self) -> LastLayerPosterior:
+        """With the standard normal prior.
+
+        Raises:
+            FactorisationError: the precision is not finite, or so large that rounding hides the prior.
+        """
+        prior = torch.eye(self.moment.shape[-1], dtype=self.moment.dtype, device=self.moment.device)
+        # No eigenvalue lies below the prior's one, so no jitter is needed.
+        factor = cholesky(self.precision + prior, self.moment.new_ones(()), jitter=0.0)
+        mean = torch.cholesky_solve(self.moment.unsqueeze(-1), factor).squeeze(-1)
+        return LastLayerPosterior(mean, factor)
+
+
+def last_layer_evidence(
     factorised: Factorised, terms: LayerTerms, passed: Passed, y: Float[Tensor, "n T"], weight: float = 1.0
-) -> LastLayerPosterior:
+) -> LastLayerEvidence:
     """Bayesian linear regression on a_n = L_z^-1 k_zn whose datum n has the noise s_n = k_nn - |a_n|^2 + noise.
 
-    precision = I + sum_n a_n a_n^T / s_n,  mean = precision^-1 sum_n a_n y_n / s_n, under the likelihood of
-    `deep_gp.log_likelihood`.
+    precision = sum_n a_n a_n^T / s_n,  moment = sum_n a_n y_n / s_n, under the likelihood of `deep_gp.log_likelihood`.
 
     Args:
         terms, passed: of the last layer.
         weight: how often each datum counts: N / n where the rows are a subset of the data.
-
-    Raises:
-        FactorisationError: the precision is not finite, or so large that rounding hides the prior.
     """
     a = terms.variance.sqrt() * passed.seen.projected
     noise = factorised.model.noise_variance
     weights = weight / (passed.variance.unsqueeze(1) + noise.unsqueeze(-1))  # "C T n"
     weighted = a.unsqueeze(1) * weights.unsqueeze(2)
-    prior = torch.eye(a.shape[-2], dtype=a.dtype, device=a.device)
-    # No eigenvalue lies below the prior's one, so no jitter is needed.
-    factor = cholesky(weighted @ a.mT.unsqueeze(1) + prior, a.new_ones(()), jitter=0.0)
-    mean = torch.cholesky_solve(weighted @ y.mT.unsqueeze(-1), factor).squeeze(-1)
-    return LastLayerPosterior(mean, factor)
+    return LastLayerEvidence(weighted @ a.mT.unsqueeze(1), (weighted @ y.mT.unsqueeze(-1)).squeeze(-1))

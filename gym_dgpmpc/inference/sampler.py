@@ -16,102 +16,37 @@ under positions of the latest SG-HMC steps.
 """
 
 import copy
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, get_args
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.standardised import Data, DataSource
-from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all
+from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
 from gym_dgpmpc.inference import sghmc
 from gym_dgpmpc.inference.adam import adam_memory
 from gym_dgpmpc.inference.gradients import (
     Gradients,
-    LayerTerms,
     Passed,
     Seen,
     forward,
     gradients,
     layer_terms,
     likelihood,
+    pass_first,
     see,
-    take,
-    take_passed,
 )
-from gym_dgpmpc.inference.last_layer import last_layer_posterior
+from gym_dgpmpc.inference.last_layer import last_layer_evidence
+from gym_dgpmpc.inference.latents import move_latents, with_latents
 from gym_dgpmpc.inference.priors import log_prior_gradient
+from gym_dgpmpc.inference.settings import InferenceSettings
 from gym_dgpmpc.inference.sghmc import SGHMCState
-
-Hyperparameters = Literal["sampled", "optimised"]
-HYPERPARAMETERS: tuple[Hyperparameters, ...] = get_args(Hyperparameters)
-
-PROPOSALS = (0.0, 0.9, 0.99)
-"""Correlations of a proposed latent with the present one: far, near and nearer, for data that say little or much."""
 
 LAST_LEARNING_RATE = 1 / 6
 """Adam's learning rate at the end of its iterations, as a share of that at their start; it falls geometrically."""
-
-
-@dataclass(frozen=True)
-class InferenceSettings:
-    """Settings of the sampler; `DeepGPDynamics` takes them as keyword arguments.
-
-    Attributes:
-        step_size: step size of SG-HMC for inducing outputs, epsilon; twice the value of Havasi et al., see
-            docs/deviations.md.
-        decay: friction of SG-HMC, m, in [0, 1].
-        hyperparameters: "sampled" with the inducing outputs, after a first half of the training that optimises them;
-            "optimised", as in the paper, gives one value for each chain and no prior.
-        hyperparameter_step_size: step size of SG-HMC for hyperparameters and inducing inputs.
-        learning_rate: learning rate of Adam, for hyperparameters and inducing inputs, at the start.
-        hyperparameters_every: iterations for each step of the hyperparameters.
-        window_size: latest SG-HMC positions, one of which is drawn for each Adam step.
-        batch_size: transitions in a minibatch; all of them where there are fewer.
-        gibbs_every: training iterations between two exact draws of the last layer, which each sample of the pool gets
-            too; 0 leaves everything to SG-HMC.
-        gibbs_rows: transitions that an exact draw is conditioned on; all of them where there are fewer.
-        patience: looks in a row without a better held-out log likelihood, after which training stops early; None trains
-            to the end, on all data.
-        look_every: iterations between two looks at how training goes.
-
-    Raises:
-        ValueError: a setting is out of its range.
-    """
-
-    step_size: float = 0.02
-    decay: float = 0.05
-    hyperparameters: Hyperparameters = "sampled"
-    hyperparameter_step_size: float = 0.02
-    learning_rate: float = 0.03
-    hyperparameters_every: int = 4
-    window_size: int = 1
-    batch_size: int = 256
-    gibbs_every: int = 20
-    gibbs_rows: int = 4096
-    patience: int | None = None
-    look_every: int = 100
-
-    def __post_init__(self) -> None:
-        names = ("hyperparameters_every", "window_size", "batch_size", "gibbs_rows", "look_every")
-        check_counts(**{name: getattr(self, name) for name in names})
-        if self.patience is not None:
-            check_counts(patience=self.patience)
-        for name in ("step_size", "hyperparameter_step_size", "learning_rate"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive and finite, received {getattr(self, name)}")
-        if not 0.0 <= self.decay <= 1.0:
-            raise ValueError(f"decay must lie in [0, 1], received {self.decay}")
-        if self.gibbs_every < 0:
-            raise ValueError(f"gibbs_every must be at least 0, received {self.gibbs_every}")
-        if self.hyperparameters not in HYPERPARAMETERS:
-            raise ValueError(
-                f"unknown hyperparameters {self.hyperparameters!r}: expected one of {', '.join(HYPERPARAMETERS)}"
-            )
 
 
 class ChainState(NamedTuple):
@@ -144,18 +79,6 @@ def initial_state(model: DeepGP, whitened: SGHMCState, num_data: int, generator:
     none = [start.new_empty(len(start), 0, layer.inducing_inputs.shape[-1]) for layer in model.layers[:-1]]
     parameters = sghmc.init(flatten(model.parameters()))
     return ChainState(whitened, parameters, with_latents(none, num_data, generator))
-
-
-def with_latents(
-    latents: list[Float[Tensor, "C n D"]], num_data: int, generator: torch.Generator
-) -> list[Float[Tensor, "C N D"]]:
-    """Latents for grown data: those of new rows are drawn from the prior."""
-    grown = []
-    for latent in latents:
-        shape = (latent.shape[0], num_data - latent.shape[1], latent.shape[2])
-        new = torch.randn(shape, generator=generator, dtype=latent.dtype, device=latent.device)
-        grown.append(torch.cat([latent, new], dim=1))
-    return grown
 
 
 class Chains:
@@ -193,7 +116,7 @@ class Chains:
     def _refactorise(self) -> None:
         self.factorised = factorise_all(with_flat(self._kernels, self.state.parameters.position))
         self._terms = layer_terms(self.factorised)
-        self._first: Seen | None = None
+        self._seen: Seen | None = None
 
     def evaluate(self, generator: torch.Generator) -> float:
         """The negative log likelihood per observation where the chains are, on a minibatch; moves nothing."""
@@ -216,7 +139,9 @@ class Chains:
         passed, latents = self._pass(state.whitened.position, batch, index, generator, move=self.iteration % 2 == 0)
         self.value = -likelihood(self.factorised, passed, batch.y).mean(-1)
         self._cooling = cooling(batch.num_rows, num_data)
-        current = self._gradients(state.whitened.position, passed, latents, batch, of_parameters=moves_parameters)
+        # Of the hyperparameters here, unless a position of the window serves for them.
+        here = moves_parameters and settings.window_size == 1
+        current = self._gradients(state.whitened.position, passed, latents, batch, of_parameters=here)
         whitened = sghmc.step(
             state.whitened,
             state.whitened.position / num_data - current.whitened,
@@ -251,9 +176,8 @@ class Chains:
         position, inner = self.state.whitened.position, self.factorised.model.num_inner()
         passed, _ = self._pass(position, batch, index, generator, move=False)
         weight = self.data.num_rows / batch.num_rows
-        posterior = last_layer_posterior(self.factorised, self._terms[-1], passed[-1], batch.y, weight)
-        drawn = posterior.sample(num_samples, generator).flatten(-2)
-        return torch.cat([position[:, :inner].expand(num_samples, -1, -1), drawn], dim=-1)
+        evidence = last_layer_evidence(self.factorised, self._terms[-1], passed[-1], batch.y, weight)
+        return evidence.posterior().positions(position[:, :inner], num_samples, generator)
 
     def _batch(self, size: int, generator: torch.Generator) -> tuple[Data, Int[Tensor, "n"] | None]:
         """Rows of the data, drawn uniformly with replacement, and which they are; None stands for all of them."""
@@ -279,10 +203,11 @@ class Chains:
         latents = [latent if index is None else latent[:, index] for latent in self.state.latents]
         x = batch.x.expand(len(position), -1, -1)
         if index is not None:
-            first = None
-        else:
-            first = self._first = self._first or see(self._terms[0], x)
-        if not move or not latents:
+            seen = see(self._terms[0], x)
+        else:  # always the same rows, until the hyperparameters move
+            seen = self._seen = self._seen or see(self._terms[0], x)
+        first = pass_first(self._terms, whitened[0], seen)
+        if not move:
             return forward(self._terms, whitened, x, latents, first), latents
         passed, latents = move_latents(self.factorised, self._terms, whitened, batch, latents, generator, first)
         for held, moved in zip(self.state.latents, latents, strict=True):
@@ -321,7 +246,7 @@ class Chains:
             gradient = gradient + prior / num_data
         gradient = -gradient
         if sampled and self.iteration > self._num_burn_in:
-            # Its preconditioner goes on adapting: where Adam ended gradients vanish, which would make steps far too long.
+            # Its preconditioner goes on adapting: where Adam ended gradients vanish, which would make steps too long.
             parameters = sghmc.step(
                 parameters,
                 gradient,
@@ -384,38 +309,6 @@ class Snapshot(NamedTuple):
     window: Tensor
     iteration: int
     value: Tensor
-
-
-def move_latents(
-    factorised: Factorised,
-    terms: list[LayerTerms],
-    whitened: list[Tensor],
-    batch: Data,
-    latents: list[Float[Tensor, "C n D"]],
-    generator: torch.Generator,
-    first: Seen | None = None,
-) -> tuple[list[Passed], list[Tensor]]:
-    """One Metropolis step of every datum's latents, given all else; the points as they then pass through the layers.
-
-    Proposed is r e + sqrt(1 - r^2) N(0, I), which leaves the prior as it is, so that the likelihoods alone decide
-    (preconditioned Crank-Nicolson; Cotter et al. 2013). r is one of `PROPOSALS`.
-    """
-    correlation = PROPOSALS[int(torch.randint(len(PROPOSALS), (1,), generator=generator, device=generator.device))]
-    both = []
-    for latent in latents:
-        fresh = torch.randn(latent.shape, generator=generator, dtype=latent.dtype, device=latent.device)
-        both.append(torch.cat([latent, correlation * latent + math.sqrt(1.0 - correlation**2) * fresh], dim=1))
-    seen = first or see(terms[0], batch.x.expand(len(whitened[0]), -1, -1))
-    twice = Seen(*(torch.cat([part, part], dim=2 if part is seen.projected else 1) for part in seen))
-    x = batch.x.expand(len(whitened[0]), -1, -1)
-    passed = forward(terms, whitened, torch.cat([x, x], dim=1), both, twice)
-    log_density = likelihood(factorised, passed, torch.cat([batch.y, batch.y]))
-    present, proposed = log_density.chunk(2, dim=1)
-    uniform = torch.rand(present.shape, generator=generator, dtype=present.dtype, device=present.device)
-    accepted = uniform.log() < proposed - present
-    rows = torch.arange(batch.num_rows, dtype=torch.int64, device=present.device)
-    rows = rows + batch.num_rows * accepted
-    return [take_passed(layer, rows) for layer in passed], [take(latent, rows) for latent in both]
 
 
 def sample(

@@ -11,14 +11,16 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.errors import FactorisationError, TrainingError
 from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, log_likelihood, propagate
 from gym_dgpmpc.inference import priors, sampler
-from gym_dgpmpc.inference.sampler import Chains, ChainState, InferenceSettings
+from gym_dgpmpc.inference.latents import with_latents
+from gym_dgpmpc.inference.sampler import Chains, ChainState
+from gym_dgpmpc.inference.settings import InferenceSettings
 from gym_dgpmpc.inference.sghmc import SGHMCState
 
 MAX_ROLLBACKS = 5
@@ -87,9 +89,9 @@ def train(
     Raises:
         TrainingError: training diverged again and again, with ever smaller steps.
     """
-    held_out = None
+    held_out, order, num_rows = None, None, data.num_rows
     if settings.patience is not None:
-        data, held_out = _split_off_held_out(data, generator)
+        data, held_out, order = _split_off_held_out(data, generator)
     state = sampler.initial_state(model, whitened, data.num_rows, generator)
     run = Chains(model, state, data, settings, round(burn_in * num_iterations))
     good, best, rollbacks = run.snapshot(), run.evaluate(_copy_of(generator)), 0
@@ -119,8 +121,10 @@ def train(
             looks_since = 0 if improved else looks_since + 1
             if looks_since == settings.patience:
                 break
-    value = float(run.value.mean())
-    return Trained(run.model, run.state, value, run.iteration, rollbacks, run.settings)
+    value, state = float(run.value.mean()), run.state
+    if order is not None:
+        state = state._replace(latents=[_in_order(latent, order, num_rows, generator) for latent in state.latents])
+    return Trained(run.model, state, value, run.iteration, rollbacks, run.settings)
 
 
 def sample_pool(
@@ -192,14 +196,23 @@ def _advance(run: Chains, num_iterations: int, generator: torch.Generator, best:
     return None
 
 
-def _split_off_held_out(data: Data, generator: torch.Generator) -> tuple[Data, Data | None]:
-    """Training data and held-out data; None where there are too few to hold any out."""
+def _split_off_held_out(data: Data, generator: torch.Generator) -> tuple[Data, Data | None, Int[Tensor, "n"] | None]:
+    """Training data, held-out data, and which rows the former are; None where there are too few to hold any out."""
     share, most = HELD_OUT
     count = min(int(share * data.num_rows), most)
     if count < MIN_HELD_OUT:
-        return data, None
+        return data, None, None
     order = torch.randperm(data.num_rows, generator=generator, device=data.x.device)
-    return data.rows(order[count:]), data.rows(order[:count])
+    return data.rows(order[count:]), data.rows(order[:count]), order[count:]
+
+
+def _in_order(
+    latent: Float[Tensor, "C n D"], rows: Int[Tensor, "n"], num_rows: int, generator: torch.Generator
+) -> Float[Tensor, "C N D"]:
+    """Latents of some rows where they belong among all rows; those of the others are drawn from the prior."""
+    (ordered,) = with_latents([latent[:, :0]], num_rows, generator)
+    ordered[:, rows] = latent
+    return ordered
 
 
 def _copy_of(generator: torch.Generator) -> torch.Generator:

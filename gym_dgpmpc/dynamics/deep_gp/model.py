@@ -7,7 +7,6 @@ calls `fit` at an episode's start, `resample` after each control step and `draw`
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
@@ -41,7 +40,8 @@ from gym_dgpmpc.gp.kernels import Kernel, find_kernel
 from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.inference import sghmc, training
 from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
-from gym_dgpmpc.inference.sampler import Chains, ChainState, InferenceSettings, flatten, with_latents
+from gym_dgpmpc.inference.following import Follower
+from gym_dgpmpc.inference.settings import InferenceSettings
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
 
@@ -54,7 +54,6 @@ class _Fitted(NamedTuple):
     latents: list[Tensor]  # "C N D" of each inner layer, float32
     pool: Tensor  # "n C V", a ring of n samples of each chain
     oldest: int  # the row of the pool that the next sample replaces
-    turn: int  # the chain that goes on next within an episode
     step_size: float  # of SG-HMC: the setting, unless training had to take smaller steps
     noise: NoiseSplit | None = None  # None: not told apart
 
@@ -101,9 +100,8 @@ class DeepGPDynamics(Learner[_Fitted]):
         num_samples: posterior samples kept (the pool), over all chains, rounded up to as many of each; the worlds of a
             plan are drawn from them.
         sample_spacing: SG-HMC steps between two samples of the pool; more of them make the samples less alike.
-        resample_steps: SG-HMC steps of one chain after each control step, of the chains in turn, by which the posterior
-            follows the new data; 0 keeps the posterior as it is within an episode.
-        resample_samples: samples of that chain that are replaced then, at least 1, if the last layer is drawn exactly.
+        resample_samples: samples of each chain that are replaced after each control step, by exact draws of the last
+            layer given the new data too; 0 keeps the posterior as it is within an episode.
         relocate: move the inducing inputs to the cluster centres of the grown data before each later fit.
         add_noise: draw the fitted noise too, so that plans reckon with it: for plants or sensors that are noisy.
         split_noise: where ``add_noise`` is on, tell the sensors' noise, which only blurs what is observed, from the
@@ -146,7 +144,6 @@ class DeepGPDynamics(Learner[_Fitted]):
         num_chains: int = 5,
         num_samples: int = 100,
         sample_spacing: int = 10,
-        resample_steps: int = 10,
         resample_samples: int = 5,
         relocate: bool = True,
         add_noise: bool = False,
@@ -165,14 +162,13 @@ class DeepGPDynamics(Learner[_Fitted]):
             num_chains=num_chains,
             num_samples=num_samples,
             sample_spacing=sample_spacing,
-            resample_samples=resample_samples,
         )
         if num_features % 2:
             raise ValueError(
                 f"num_features must be even, a cosine and a sine of each frequency: received {num_features}"
             )
-        if resample_steps < 0:
-            raise ValueError(f"resample_steps must be at least 0, received {resample_steps}")
+        if resample_samples < 0:
+            raise ValueError(f"resample_samples must be at least 0, received {resample_samples}")
         if draw not in DRAWS:
             raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(DRAWS)}")
         if refresh not in REFRESHES:
@@ -185,9 +181,10 @@ class DeepGPDynamics(Learner[_Fitted]):
         self.first_training_iterations, self.training_iterations = first_training_iterations, training_iterations
         self.num_chains, self.num_samples, self.sample_spacing = num_chains, num_samples, sample_spacing
         self._samples_of_chain = -(-num_samples // num_chains)
-        self.relocate, self.resample_steps = relocate, resample_steps
+        self.relocate = relocate
         self.resample_samples = min(resample_samples, self._samples_of_chain)
         self.inference = InferenceSettings(**inference)
+        self._follower: Follower | None = None  # of what was fitted, once it is followed
         self.compile = compile and dtype == torch.float32 and self.device.type == "cpu"
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
@@ -239,65 +236,43 @@ class DeepGPDynamics(Learner[_Fitted]):
         noise = self._split_noise(data, normalisers, posterior_mean(factorised, sampled.pool), variance)
         latents = [latent.float() for latent in sampled.state.latents]
         chain, step_size = sampled.state.whitened, sampled.step_size
-        self._fitted = _Fitted(factorised, normalisers, chain, latents, sampled.pool, 0, 0, step_size, noise)
+        self._follower = None
+        self._fitted = _Fitted(factorised, normalisers, chain, latents, sampled.pool, 0, step_size, noise)
         counts = {"iterations": float(trained.num_iterations), "rollbacks": float(trained.num_rollbacks)}
         metrics = {"negative_log_likelihood": trained.negative_log_likelihood} | counts
         return metrics | self._diagnostics(self._fitted) | self._noise_metrics(noise, normalisers[1], variance)
 
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
-        """Follow the grown data: one chain, of all in turn, goes on, and its newest samples replace its oldest.
+        """Follow the grown data: in every chain exact draws of the last layer replace the oldest samples.
 
-        They are ``resample_samples`` exact draws of the last layer, after a few SG-HMC steps over all layers; without
-        exact draws (``gibbs_every=0``) the position that those steps lead to. A chain that leaves what is plausible is
-        put back, and its samples stay as they were.
+        Hyperparameters and inner layers stay as they are until the next fit. Where the new data make the posterior
+        impossible to compute, the samples stay as they were.
 
         Returns:
-            ``resamplings_dropped``: 1 if that happened, otherwise 0; an empty mapping if there are no steps to take.
+            ``resamplings_dropped``: 1 if that happened, otherwise 0; an empty mapping if there is nothing to replace.
 
         Raises:
             RuntimeError: the model was not fitted.
         """
         fitted = self._require_fit("resample")
-        if self.resample_steps == 0:
+        if self.resample_samples == 0:
             return {}
-        try:
-            moved, newest = self._go_on(fitted, data, generator)
-        except FactorisationError:  # in an exact draw: the steps before it left values that are not finite
-            return {"resamplings_dropped": 1.0}
-        if not training.is_plausible(newest):
-            return {"resamplings_dropped": 1.0}
-        turn, count = fitted.turn, self._samples_of_chain
-        rows = (fitted.oldest + torch.arange(len(newest), dtype=torch.int64, device=self.device)) % count
-        fitted.pool[rows, turn] = newest
-        following = (turn + 1) % self.num_chains
-        oldest = fitted.oldest if following else (fitted.oldest + len(newest)) % count
-        self._fitted = moved._replace(turn=following, oldest=oldest)
-        return {"resamplings_dropped": 0.0}
-
-    def _go_on(
-        self, fitted: _Fitted, data: Transitions, generator: torch.Generator
-    ) -> tuple[_Fitted, Float[Tensor, "n V"]]:
-        """The chain whose turn it is some steps on, and its newest samples, of which the last is where it then is."""
+        position, inner = fitted.chain.position, fitted.factorised.model.num_inner()
+        if self._follower is None:
+            self._follower = Follower(fitted.factorised, position[:, :inner])
         standardised = _Standardised(self._encode, data, fitted.normalisers)
-        settings = replace(self.inference, step_size=fitted.step_size)
-        own = slice(fitted.turn, fitted.turn + 1)
-        model = fitted.factorised.model.at(torch.tensor([fitted.turn], dtype=torch.int64, device=self.device))
-        latents = with_latents(fitted.latents, standardised.num_rows, generator)
-        state = ChainState(
-            sghmc.SGHMCState(*(field[own] for field in fitted.chain)),
-            sghmc.init(flatten(model.parameters())),
-            [latent[own].to(model.log_noise) for latent in latents],
-        )
-        chains = Chains(model, state, standardised, settings, 0)
-        for _ in range(self.resample_steps):
-            chains.step(generator, frozen=True)
-        newest = chains.state.whitened.position
-        if settings.gibbs_every:
-            newest = chains.last_layer_draws(self.resample_samples, generator)[:, 0]
-        moved = chains.state.whitened._replace(position=newest[-1:])
-        chain = sghmc.SGHMCState(*(_put(whole, own, part) for whole, part in zip(fitted.chain, moved, strict=True)))
-        latents = [_put(whole, own, part.float()) for whole, part in zip(latents, chains.state.latents, strict=True)]
-        return fitted._replace(chain=chain, latents=latents), newest
+        count = self._samples_of_chain
+        try:
+            newest, latents = self._follower.follow(
+                position, standardised, fitted.latents, self.resample_samples, generator
+            )
+        except FactorisationError:
+            return {"resamplings_dropped": 1.0}
+        rows = (fitted.oldest + torch.arange(len(newest), dtype=torch.int64, device=self.device)) % count
+        fitted.pool[rows] = newest
+        chain, oldest = fitted.chain._replace(position=newest[-1]), (fitted.oldest + len(newest)) % count
+        self._fitted = fitted._replace(chain=chain, latents=latents, oldest=oldest)
+        return {"resamplings_dropped": 0.0}
 
     def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
         """Worlds for plans of ``horizon`` steps: particles are spread over the chains, each a sample of its chain.
@@ -358,7 +333,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             return {}
         fitted, model = self._fitted, self._fitted.factorised.model
         # The pool is the one tensor that changes in place, which must not change a state taken before.
-        state: StateDict = {"pool": fitted.pool.clone(), "oldest": fitted.oldest, "turn": fitted.turn}
+        state: StateDict = {"pool": fitted.pool.clone(), "oldest": fitted.oldest}
         state["log_noise"] = model.log_noise
         if fitted.step_size != self.inference.step_size:  # older states do not have this entry
             state["step_size"] = fitted.step_size
@@ -375,7 +350,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             ValueError: an entry is missing or is not what these settings give it; the model stays as it was.
         """
         if not state:
-            self._fitted = None
+            self._fitted = self._follower = None
             return
         size, num_targets, device = self.encoder.input_size, self.encoder.target_size, self.device
         whitened = self.num_inducing * (size * (self.num_layers - 1) + num_targets)
@@ -384,12 +359,6 @@ class DeepGPDynamics(Learner[_Fitted]):
 
         def take(name: str, *shape: int) -> Tensor:
             return take_tensor(state, name, shape, device)
-
-        def take_index(name: str, below: int) -> int:
-            value = state.get(name)
-            if not isinstance(value, int) or not 0 <= value < below:
-                raise ValueError(f"dynamics state {name!r}: expected one of 0 to {below - 1}, received {value!r}")
-            return value
 
         shapes = parameter_shapes(self.num_inducing, size)
         shapes = {name: (chains, *shape) for name, shape in shapes.items()}
@@ -404,13 +373,16 @@ class DeepGPDynamics(Learner[_Fitted]):
         )
         chain = sghmc.SGHMCState(*(take(f"chain.{name}", chains, whitened) for name in sghmc.SGHMCState._fields))
         pool = take("pool", count, chains, whitened)
-        oldest, turn = take_index("oldest", count), take_index("turn", chains)
+        oldest = state.get("oldest")
+        if not isinstance(oldest, int) or not 0 <= oldest < count:
+            raise ValueError(f"dynamics state 'oldest': expected one of 0 to {count - 1}, received {oldest!r}")
         latents = [self._take_latent(state, f"latents.{i}") for i in range(self.num_layers - 1)]
         step_size = state.get("step_size", self.inference.step_size)
         if not isinstance(step_size, float) or not 0.0 < step_size < math.inf:
             raise ValueError(f"dynamics state 'step_size': expected a positive number, received {step_size!r}")
         noise = take_noise_split(state, num_targets, device)
-        self._fitted = _Fitted(factorise_all(model), normalisers, chain, latents, pool, oldest, turn, step_size, noise)
+        self._follower = None
+        self._fitted = _Fitted(factorise_all(model), normalisers, chain, latents, pool, oldest, step_size, noise)
 
     def _take_latent(self, state: StateDict, name: str) -> Float[Tensor, "C N D"]:
         """The latents of an inner layer, for however many rows there were."""
@@ -433,11 +405,6 @@ class DeepGPDynamics(Learner[_Fitted]):
         for index, layer in enumerate(model.layers):
             metrics[f"layer_{index + 1}_kernel_std"] = float(layer.variance.sqrt().mean())
         return metrics
-
-
-def _put(whole: Tensor, where: slice, part: Tensor) -> Tensor:
-    """A copy of the whole with another part in this place of its first axis."""
-    return torch.cat([whole[: where.start], part, whole[where.stop :]])
 
 
 def _report_nothing(done: int, total: int, loss: float) -> None:

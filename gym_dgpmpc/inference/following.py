@@ -1,0 +1,126 @@
+"""The posterior follows new data within an episode: the last layer exactly, at a cost that does not grow with the data.
+
+Between two trainings the hyperparameters and inner layers of every chain stay as they are. What a datum says of the
+last layer then is a term of a sum (`last_layer.py`), so only the terms of new data are to be found. Their latents are
+part of the chain's state, as in training, and are moved given the last draw.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gym_dgpmpc.data.standardised import Data, DataSource
+from gym_dgpmpc.gp.deep_gp import Factorised
+from gym_dgpmpc.inference.gradients import forward, layer_terms
+from gym_dgpmpc.inference.last_layer import LastLayerEvidence, last_layer_evidence
+from gym_dgpmpc.inference.latents import move_latents, with_latents
+
+BLOCK = 32
+"""Rows whose terms are added together, once and for all as soon as there are so many. Sums over whole blocks, in their
+order, are the same numbers whether they were made one by one or all at once after loading."""
+
+MOVES = 1
+"""Metropolis steps of the latents of each row of the newest block, after each new row."""
+
+
+class Followed(NamedTuple):
+    """Samples of the chains under the grown data."""
+
+    positions: Float[Tensor, "n C V"]
+    latents: list[Float[Tensor, "C N D"]]
+    """Of every row, float32."""
+
+
+class Follower:
+    """Keeps the sum over all whole blocks of rows.
+
+    Args:
+        factorised: C models, which stay.
+        inner: inducing outputs of the inner layers, which stay.
+    """
+
+    def __init__(self, factorised: Factorised, inner: Float[Tensor, "C I"]):
+        self._factorised, self._inner = factorised, inner
+        self._terms = layer_terms(factorised)
+        chains, targets = factorised.model.log_noise.shape
+        size = factorised.model.layers[-1].inducing_inputs.shape[-2]
+        self._sum = LastLayerEvidence(
+            inner.new_zeros(chains, targets, size, size), inner.new_zeros(chains, targets, size)
+        )
+        self._num_summed = 0
+
+    def follow(
+        self,
+        position: Float[Tensor, "C V"],
+        data: DataSource,
+        latents: Sequence[Float[Tensor, "C N D"]],
+        num_samples: int,
+        generator: torch.Generator,
+    ) -> Followed:
+        """Draw from the posterior given all rows.
+
+        Args:
+            position: where the chains are.
+            data: the rows of the call before, and behind them new ones.
+            latents: those of the call before, float32.
+            num_samples: of each chain; they share its inner layers.
+
+        Raises:
+            FactorisationError: the data's terms are not finite; nothing has changed.
+        """
+        # Depends on what is given alone, so that chains that were saved and loaded go the same way.
+        unsettled = _whole(latents[0].shape[1]) if latents else data.num_rows
+        grown = with_latents(latents, data.num_rows, generator)
+        if unsettled < data.num_rows:
+            self._move(position, data, grown, unsettled, generator)
+        total, whole = self._sum, _whole(data.num_rows)
+        for first in range(self._num_summed, whole, BLOCK):
+            total = total.plus(self._evidence(data, grown, first, first + BLOCK))
+        evidence = total
+        if whole < data.num_rows:
+            evidence = total.plus(self._evidence(data, grown, whole, data.num_rows))
+        positions = evidence.posterior().positions(self._inner, num_samples, generator)
+        self._sum, self._num_summed = total, whole
+        return Followed(positions, grown)
+
+    def _move(
+        self,
+        position: Float[Tensor, "C V"],
+        data: DataSource,
+        latents: list[Float[Tensor, "C N D"]],
+        first: int,
+        generator: torch.Generator,
+    ) -> None:
+        """Move the latents of the rows from ``first`` on, in place."""
+        batch, whitened = _rows(data, first, data.num_rows, position), self._factorised.model.split(position)
+        moved = [latent[:, first:].to(position) for latent in latents]
+        passed = None
+        for _ in range(MOVES):
+            every, moved = move_latents(self._factorised, self._terms, whitened, batch, moved, generator, passed)
+            passed = every[0]
+        for latent, new in zip(latents, moved, strict=True):
+            latent[:, first:] = new.float()
+
+    def _evidence(
+        self, data: DataSource, latents: list[Float[Tensor, "C N D"]], first: int, end: int
+    ) -> LastLayerEvidence:
+        """Of the rows from ``first`` to ``end``."""
+        batch = _rows(data, first, end, self._inner)
+        # What the last layer is fed does not depend on where it is itself.
+        none = self._inner.new_zeros(len(self._inner), self._factorised.model.num_whitened() - self._inner.shape[1])
+        whitened = self._factorised.model.split(torch.cat([self._inner, none], dim=1))
+        x = batch.x.expand(len(self._inner), -1, -1)
+        passed = forward(self._terms, whitened, x, [latent[:, first:end].to(x) for latent in latents])
+        return last_layer_evidence(self._factorised, self._terms[-1], passed[-1], batch.y)
+
+
+def _whole(num_rows: int) -> int:
+    """The rows in whole blocks."""
+    return num_rows - num_rows % BLOCK
+
+
+def _rows(data: DataSource, first: int, end: int, like: Tensor) -> Data:
+    return data.rows(torch.arange(first, end, dtype=torch.int64, device=like.device))
