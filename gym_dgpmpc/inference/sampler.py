@@ -48,6 +48,9 @@ from gym_dgpmpc.inference.sghmc import SGHMCState
 LAST_LEARNING_RATE = 1 / 6
 """Adam's learning rate at the end of its iterations, as a share of that at their start; it falls geometrically."""
 
+MOST_TURNED, MOST_HEATED = 0.25, 0.1
+"""See `step_sizes`: of the squared angle that a step turns, and of the variance that minibatches add."""
+
 
 class ChainState(NamedTuple):
     """Where C chains are."""
@@ -103,7 +106,7 @@ class Chains:
         self._optimiser = torch.optim.Adam([self._flat], lr=settings.learning_rate)
         self._optimiser.state[self._flat] = adam_memory(self._flat)
         self._window = self._flat.new_empty(settings.window_size, *state.whitened.position.shape)
-        self.iteration, self._cooling = 0, 1.0
+        self.iteration = 0
         self.value = self._flat.new_zeros(state.num_chains)
         """The last negative log likelihood per observation, on a minibatch, of each chain."""
         self._refactorise()
@@ -138,7 +141,6 @@ class Chains:
         batch, index = self._batch(settings.batch_size, generator)
         passed, latents = self._pass(state.whitened.position, batch, index, generator, move=self.iteration % 2 == 0)
         self.value = -likelihood(self.factorised, passed, batch.y).mean(-1)
-        self._cooling = cooling(batch.num_rows, num_data)
         # Of the hyperparameters here, unless a position of the window serves for them.
         here = moves_parameters and settings.window_size == 1
         current = self._gradients(state.whitened.position, passed, latents, batch, of_parameters=here)
@@ -147,7 +149,7 @@ class Chains:
             state.whitened.position / num_data - current.whitened,
             num_data,
             generator,
-            step_size=self._cooling * settings.step_size,
+            step_size=step_sizes(state.whitened, settings.step_size, settings.decay, batch.num_rows, num_data),
             decay=settings.decay,
             burn_in=self.iteration < self._num_burn_in,
         )
@@ -160,7 +162,7 @@ class Chains:
             if settings.window_size > 1:
                 current = self._at_window(batch, index, generator)
             assert current.parameters is not None
-            self._move_parameters(flatten(current.parameters), num_data, generator)
+            self._move_parameters(flatten(current.parameters), batch.num_rows, generator)
 
     def draw_last_layer(self, generator: torch.Generator) -> None:
         """Draw the last layer's inducing outputs exactly, given all else, and bring them to rest there."""
@@ -237,9 +239,9 @@ class Chains:
         passed, latents = self._pass(held[pick], batch, index, generator, move=False)
         return self._gradients(held[pick], passed, latents, batch, of_parameters=True)
 
-    def _move_parameters(self, gradient: Float[Tensor, "C H"], num_data: int, generator: torch.Generator) -> None:
+    def _move_parameters(self, gradient: Float[Tensor, "C H"], batch_size: int, generator: torch.Generator) -> None:
         """An Adam step, or, after the burn-in of "sampled" ones, an SG-HMC step; ``gradient`` is the likelihood's."""
-        settings, parameters = self.settings, self.state.parameters
+        settings, parameters, num_data = self.settings, self.state.parameters, self.data.num_rows
         sampled = settings.hyperparameters == "sampled"
         if sampled:
             prior = flatten(log_prior_gradient(self.factorised.model))
@@ -252,7 +254,9 @@ class Chains:
                 gradient,
                 num_data,
                 generator,
-                step_size=self._cooling * settings.hyperparameter_step_size,
+                step_size=step_sizes(
+                    parameters, settings.hyperparameter_step_size, settings.decay, batch_size, num_data
+                ),
                 decay=settings.decay,
                 burn_in=True,
             )
@@ -292,13 +296,20 @@ class Chains:
         self._refactorise()
 
 
-def cooling(batch_size: int, num_data: int) -> float:
-    """What a step size is multiplied by where gradients are those of minibatches.
+def step_sizes(
+    state: SGHMCState, step_size: float, decay: float, batch_size: int, num_data: int
+) -> Float[Tensor, "C V"]:
+    """The step size of each coordinate: ``step_size``, or less where the posterior is stiff or minibatches are noisy.
 
-    With M^-1 = 1 / sd(g) the noise of such a gradient adds eps^2 N sd(g) / 2 m times the variance that SG-HMC injects
-    (eps^4 M^-2 var(g) to 2 eps^2 m M^-1 / N). With eps in proportion to N^-1/2 that share does not grow with the data.
+    A coordinate's potential has the curvature (N sd(g))^2, and a mass of sd(g), so that it turns by eps^2 N sd(g) a
+    step, squared; the samples' variance is too large by a quarter of that. The noise of a minibatch adds
+    eps^2 N sd(g) / 2 m times the variance that SG-HMC injects (eps^4 M^-2 var(g) to 2 eps^2 m M^-1 / N). So one bound on
+    eps^2 N sd(g) serves for both. Coordinates that the data say little about keep long steps, which they need to mix.
     """
-    return min(1.0, (batch_size / num_data) ** 0.5)
+    most = MOST_TURNED
+    if batch_size < num_data:
+        most = min(most, 2.0 * decay * MOST_HEATED / (1.0 - batch_size / num_data))
+    return (most / num_data * state.inverse_mass()).clamp_max(step_size**2).sqrt()
 
 
 class Snapshot(NamedTuple):

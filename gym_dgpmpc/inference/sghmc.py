@@ -52,7 +52,7 @@ def step(
     num_data: int,
     generator: torch.Generator,
     *,
-    step_size: float = 0.01,
+    step_size: float | Float[Tensor, "*c V"] = 0.01,
     decay: float = 0.05,
     burn_in: bool = True,
 ) -> SGHMCState:
@@ -63,7 +63,7 @@ def step(
     Args:
         gradient: of the negative log joint per observation, on a minibatch or all data.
         num_data: N, the number of observations in the *current* data.
-        step_size: eps.
+        step_size: eps, of each coordinate its own if need be.
         decay: m, the friction.
         burn_in: also adapt the preconditioner, before using it.
     """
