@@ -1,8 +1,8 @@
 """The sampler against the joint posterior of two layers: chains that start in it stay in it.
 
-The problem is so small that draws from the prior, weighted by the likelihood with the last layer integrated out, are the
-exact posterior. A thousand chains start at such draws. Whatever moves them must leave their law as it is; latents that
-are drawn from their prior, or an exact draw of the last layer given such, do not.
+The problem is so small that draws from the prior, weighted by the likelihood with the last layer integrated out, are
+the exact posterior. A thousand chains start at such draws. Whatever moves them must leave their law as it is; latents
+that are drawn from their prior, or an exact draw of the last layer given such, do not.
 """
 
 import pytest
@@ -13,7 +13,8 @@ from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
 from gym_dgpmpc.gp.kernels import find_kernel
 from gym_dgpmpc.gp.layer import Layer, conditional, project
 from gym_dgpmpc.inference import sghmc
-from gym_dgpmpc.inference.sampler import Chains, ChainState, InferenceSettings, flatten
+from gym_dgpmpc.inference.sampler import Chains, ChainState, flatten
+from gym_dgpmpc.inference.settings import InferenceSettings
 from tests.oracles.models import normal, seeded
 
 X = torch.tensor([[-1.2], [-0.8], [-0.3], [0.1], [0.5], [1.1]], dtype=torch.float64)

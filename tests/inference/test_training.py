@@ -11,7 +11,8 @@ from gym_dgpmpc.errors import FactorisationError, TrainingError
 from gym_dgpmpc.gp.deep_gp import factorise_all, log_likelihood, propagate
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.inference import sampler, sghmc, training
-from gym_dgpmpc.inference.sampler import Chains, InferenceSettings
+from gym_dgpmpc.inference.sampler import Chains
+from gym_dgpmpc.inference.settings import InferenceSettings
 from gym_dgpmpc.inference.training import predictive_log_likelihood, train
 from tests.oracles.models import normal, seeded
 

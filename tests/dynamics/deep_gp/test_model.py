@@ -8,7 +8,7 @@ import torch
 from gym_dgpmpc.dynamics.deep_gp import start as deep_gp_start
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.errors import TrainingError
-from gym_dgpmpc.inference.sampler import InferenceSettings
+from gym_dgpmpc.inference.settings import InferenceSettings
 from gym_dgpmpc.planning.rollout import rollout
 from gym_dgpmpc.types import DynamicsModel, ObservationSpec, Transitions
 from tests.oracles import pendulum
