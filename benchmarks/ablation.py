@@ -17,7 +17,8 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from benchmarks import RESULTS
-from benchmarks.calibration import random_episode, score
+from benchmarks.calibration.episodes import random_episode
+from benchmarks.calibration.scores import forecast, scores
 from benchmarks.rows import Row, measure_missing
 from gym_dgpmpc import DGPMPCAgent
 from gym_dgpmpc.agents.presets import PAPER
@@ -68,9 +69,11 @@ def measure(wanted: Row) -> Row:
     row: Row = {}
     tests = [random_episode(source, test_seed, 0.8) for test_seed in TEST_SEEDS]
     spread = torch.cat([test.next_observation for test in tests]).std(0)
-    for horizon in HORIZONS:
-        scores = score(agent.dynamics, tests, horizon, torch.Generator().manual_seed(seed), spread=spread)
-        row |= {f"{name}_{horizon}": scores[name] for name in ("error", "coverage_90")}
+    by_horizon = forecast(agent.dynamics, tests, HORIZONS, torch.Generator().manual_seed(seed))
+    for horizon, (particles, truth) in by_horizon.items():
+        # What never changes has no spread, and nothing to predict.
+        found = scores((particles / spread)[..., spread > 0], (truth / spread)[..., spread > 0])
+        row |= {f"error_{horizon}": found["rmse"], f"coverage_90_{horizon}": found["coverage_90"]}
     started, kept = time.process_time(), _OneEpisode()
     agent.learn(steps, kept, log_interval=sys.maxsize)
     row["return"] = kept.values["rollout/ep_return"]

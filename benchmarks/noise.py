@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.calibration import score
+from benchmarks.calibration.scores import forecast, scores
 from benchmarks.rows import Row, measure_missing
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
@@ -55,8 +55,9 @@ def episode(steps: int, gain: float, process_std: float, observation_std: float,
 
 
 def coverage(model: DynamicsModel, tests: list[Transitions], generator: torch.Generator) -> dict[int, float]:
-    """How often what is observed after H steps lies in the 90 % interval; see `score`."""
-    return {horizon: score(model, tests, horizon, generator)["coverage_90"] for horizon in HORIZONS}
+    """How often what is observed after H steps lies in the 90 % interval; see `scores`."""
+    by_horizon = forecast(model, tests, HORIZONS, generator)
+    return {horizon: scores(*ahead)["coverage_90"] for horizon, ahead in by_horizon.items()}
 
 
 def measure(wanted: Row) -> Row:

@@ -1,8 +1,9 @@
 """How well models know what they do not know, on recorded episodes: `python -m benchmarks.calibration`.
 
 Every model is trained on 1, 2 and 4 episodes of a learning run, and forecasts 1 to 40 steps of episodes that it has not
-seen, on the run's policy and off it. Writes `calibration.json`, one row for each seed, and `calibration.md`, the means
-over seeds; what is in the former already is not measured again.
+seen, on the run's policy and off it. Writes a file of rows, one for each seed, for every task and model, and
+`calibration.md`, the means over seeds. What is in a file already is not measured again; several commands may run beside
+each other if their tasks or models differ.
 """
 
 import argparse
@@ -24,6 +25,16 @@ from benchmarks.rows import command
 from gym_dgpmpc.checkpoints.files import replace_text
 
 SCORES = ("coverage_50", "coverage_90", "coverage_95", "nll", "crps", "rmse", "z2")
+
+
+def rows_file(task: str, model: str) -> str:
+    return f"{task}_{model.replace(', ', '-').replace(' ', '-')}.json"
+
+
+def every_row(results: Path) -> list[dict[str, Any]]:
+    """Of all tasks and models, in the order of `TASKS` and `MODELS`."""
+    files = [results / rows_file(task, name) for task in TASKS for name in MODELS]
+    return [row for file in files if file.exists() for row in json.loads(file.read_text())["rows"]]
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -53,25 +64,23 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS / "calibration")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    file = arguments.results / "calibration.json"
-    rows: list[dict[str, Any]] = json.loads(file.read_text())["rows"] if file.exists() else []
+    arguments.results.mkdir(parents=True, exist_ok=True)
     about = {"command": command("calibration"), "torch": torch.__version__}
     for seed in arguments.seeds:
         for task in arguments.tasks:
             for name in arguments.models:
-                done = {
-                    row["episodes"] for row in rows if (row["task"], row["seed"], row["model"]) == (task, seed, name)
-                }
-                if done >= set(arguments.episodes):
+                file = arguments.results / rows_file(task, name)
+                rows = json.loads(file.read_text())["rows"] if file.exists() else []
+                if {row["episodes"] for row in rows if row["seed"] == seed} >= set(arguments.episodes):
                     continue
                 started = time.time()
                 found = measure(MODELS[name], task, seed, tuple(arguments.episodes), arguments.data)
                 rows += [{"model": name} | row | about for row in found]
-                arguments.results.mkdir(parents=True, exist_ok=True)
                 replace_text(file, json.dumps({"rows": rows}, indent=1) + "\n")
-                replace_text(arguments.results / "calibration.md", table(rows))
                 print(f"{task}, seed {seed}, {name}: {time.time() - started:.0f} s", flush=True)
-    print(table(rows))
+    shown = table(every_row(arguments.results))
+    replace_text(arguments.results / "calibration.md", shown)
+    print(shown)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ The runs were made with the `COMMAND` below; a cheap model is good enough for th
 """
 
 import argparse
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,7 +48,13 @@ class Recording(NamedTuple):
     observation: Float[Tensor, "E T+1 S"]
     action: Float[Tensor, "E T A"]
 
-    def transitions(self, episodes: range) -> Transitions:
+    @classmethod
+    def of(cls, episodes: Sequence[Transitions]) -> "Recording":
+        """Episodes of one length."""
+        observation = [torch.cat([episode.observation, episode.next_observation[-1:]]) for episode in episodes]
+        return cls(torch.stack(observation), torch.stack([episode.action for episode in episodes]))
+
+    def transitions(self, episodes: Sequence[int]) -> Transitions:
         """These episodes, one after the other."""
         chosen = list(episodes)
         observation, action = self.observation[chosen], self.action[chosen]
@@ -76,42 +83,37 @@ def observation_spec(task: str) -> ObservationSpec | None:
     return env.get_wrapper_attr("observation_spec") if env.has_wrapper_attr("observation_spec") else None
 
 
-def random_episode(env: gymnasium.Env, seed: int, smoothing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Observations [T + 1, S] and actions [T, A] of an episode under random actions.
-
-    They are uniform (``smoothing`` 0) or follow a bounded autoregression.
-    """
-    rng, actions = np.random.default_rng(seed), []
+def random_episode(env: gymnasium.Env, seed: int, smoothing: float) -> Transitions:
+    """An episode under actions that are uniform (``smoothing`` 0) or follow a bounded autoregression."""
+    rng, rows = np.random.default_rng(seed), []
     assert isinstance(env.action_space, gymnasium.spaces.Box)
     low, high = env.action_space.low, env.action_space.high
     observation, _ = env.reset(seed=seed)
-    observations, level, done = [observation], (low + high) / 2, False
+    level, done = (low + high) / 2, False
     while not done:
         noise = rng.normal(0, 0.2 * (high - low)) if smoothing else rng.uniform(low, high)
         level = np.clip(smoothing * level + noise, low, high)
-        observation, _, terminated, truncated, _ = env.step(level.astype(np.float32))
-        actions.append(level)
-        observations.append(observation)
-        done = terminated or truncated
-    return np.array(observations, np.float32), np.array(actions, np.float32)
+        after, _, terminated, truncated, _ = env.step(level.astype(np.float32))
+        rows.append((observation, level, after))
+        observation, done = after, terminated or truncated
+    return Transitions(*(torch.as_tensor(np.array(column), dtype=torch.float32) for column in zip(*rows, strict=True)))
 
 
-def record(runs: Path, task: str) -> dict[str, np.ndarray]:
-    """The arrays of one file, from the folders of finished runs."""
-    by_seed = []
-    for seed in SEEDS:
-        agent = DGPMPCAgent.load(runs / f"{task}-{seed}" / "agent.zip")
-        arrays = agent.to_arrays()
-        episodes = []
-        for index in range(NUM_LEARNED):
-            rows = arrays["episode"] == index
-            last = arrays["next_observation"][rows][-1:]
-            episodes.append((np.concatenate([arrays["observation"][rows], last]), arrays["action"][rows]))
-        env = gymnasium.make(TASKS[task])
-        episodes += [random_episode(env, 5000 + seed, smoothing) for smoothing in (0.0, 0.8)]
-        by_seed.append(tuple(np.array(column, np.float32) for column in zip(*episodes, strict=True)))
-    observation, action = (np.stack(column) for column in zip(*by_seed, strict=True))
-    return {"seed": np.array(SEEDS), "observation": observation, "action": action}
+def record(runs: Path, task: str, seed: int) -> Recording:
+    """The episodes of a finished run, and the two that are not learned from."""
+    arrays = DGPMPCAgent.load(runs / f"{task}-{seed}" / "agent.zip").to_arrays()
+    episodes = []
+    for index in range(NUM_LEARNED):
+        rows = arrays["episode"] == index
+        episodes.append(Transitions(*(torch.as_tensor(arrays[name][rows]) for name in Transitions._fields)))
+    env = gymnasium.make(TASKS[task])
+    return Recording.of(episodes + [random_episode(env, 5000 + seed, smoothing) for smoothing in (0.0, 0.8)])
+
+
+def save(file: Path, recordings: Mapping[int, Recording]) -> None:
+    """Write the recordings of a task, by their seeds."""
+    observation, action = (torch.stack(column).float().numpy() for column in zip(*recordings.values(), strict=True))
+    np.savez_compressed(file, seed=np.array(list(recordings)), observation=observation, action=action)
 
 
 def main() -> None:
@@ -122,7 +124,7 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for task in arguments.tasks:
-        np.savez_compressed(arguments.out / f"{task}.npz", **record(arguments.runs, task))
+        save(arguments.out / f"{task}.npz", {seed: record(arguments.runs, task, seed) for seed in SEEDS})
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ def measure(
     if getattr(make, "func", None) is EnsembleDynamics:
         settings = {**NETWORKS.get(task, {}), **settings}
     model, generator = make(*sizes, spec, **settings), torch.Generator().manual_seed(seed)
-    predicted = [i for i in range(sizes[0]) if spec is None or i not in spec.constant]
+    predicted = model.encoder.predicted
     rows: list[dict[str, Any]] = []
     seconds = 0.0
     for count in range(1, max(episodes) + 1):
@@ -39,21 +39,12 @@ def measure(
         if count not in episodes:
             continue
         for name, tested in (("on", [count]), ("off", [WHITE, SMOOTH])):
-            by_horizon: dict[int, list[tuple[torch.Tensor, torch.Tensor]]] = {}
-            started = time.process_time()
-            for episode in tested:
-                drawn, truth = forecast(
-                    model, recording.observation[episode], recording.action[episode], HORIZONS[task], generator
-                )
-                for horizon in drawn:
-                    by_horizon.setdefault(horizon, []).append((drawn[horizon], truth[horizon]))
-            for horizon, pairs in by_horizon.items():
-                particles = torch.cat([pair[0] for pair in pairs], dim=1) / unit
-                truths = torch.cat([pair[1] for pair in pairs]) / unit
+            played = [recording.transitions([episode]) for episode in tested]
+            for horizon, (particles, truth) in forecast(model, played, HORIZONS[task], generator).items():
                 about = {"task": task, "seed": seed, "episodes": count, "test": name, "horizon": horizon}
                 rows.append(
                     about
-                    | scores(particles[..., predicted], truths[..., predicted])
+                    | scores((particles / unit)[..., predicted], (truth / unit)[..., predicted])
                     | {"fit_seconds": seconds, "noise_std": float(metrics.get("noise_std", float("nan")))}
                 )
     return rows

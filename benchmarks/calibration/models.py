@@ -7,10 +7,8 @@ from typing import Any
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
 from gym_dgpmpc.dynamics.sparse_gp.model import SparseGPDynamics
-from gym_dgpmpc.types import DynamicsModel
 
-Make = Callable[..., DynamicsModel]
-
+Make = Callable[..., DeepGPDynamics | EnsembleDynamics | SparseGPDynamics]
 
 _REACHER_NETWORKS = {
     "num_hidden_layers": 4,

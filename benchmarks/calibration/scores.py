@@ -1,17 +1,18 @@
 """How well predictive samples know what they do not know: coverage, likelihood, CRPS, error.
 
-`forecast` takes particles of a model along recorded actions; `scores` compares them with what happened. All scores are
-in units of each dimension's spread over the task's recordings, so that tasks can stand side by side.
+`forecast` takes particles of a model along recorded actions; `scores` compares them with what happened. Both may be in
+units of each dimension's spread, so that tasks can stand side by side.
 """
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.types import DynamicsModel
+from gym_dgpmpc.types import DynamicsModel, Transitions
 
 NUM_DRAWS, NUM_PARTICLES = 40, 5
 """Worlds are drawn as for plans: five at a time, and forty times over, as an episode's plans do."""
@@ -22,32 +23,40 @@ STRIDE = 5
 LEVELS = (0.5, 0.9, 0.95)
 
 FLOOR = 1e-4
-"""The least standard deviation that a Gaussian score takes a forecast for, of a dimension's spread."""
+"""The least standard deviation that a Gaussian score takes a forecast for, in the forecast's units."""
+
+
+class Forecast(NamedTuple):
+    """Of K points, in raw units."""
+
+    particles: Float[Tensor, "N K S"]
+    truth: Float[Tensor, "K S"]
 
 
 def forecast(
-    model: DynamicsModel,
-    observation: Float[Tensor, "T+1 S"],
-    action: Float[Tensor, "T A"],
-    horizons: Sequence[int],
-    generator: torch.Generator,
-) -> tuple[dict[int, Float[Tensor, "N K S"]], dict[int, Float[Tensor, "K S"]]]:
-    """Particles of the model some steps ahead from every `STRIDE`-th step of an episode, and what was observed there.
+    model: DynamicsModel, episodes: Sequence[Transitions], horizons: Sequence[int], generator: torch.Generator
+) -> dict[int, Forecast]:
+    """Particles some steps ahead from every `STRIDE`-th step of each episode, and what was observed there.
 
-    Every start must have the longest horizon before it.
+    Only steps that have the longest horizon before them; all horizons are seen from the same ones.
     """
     longest = max(horizons)
-    start = torch.arange(0, len(action) - longest + 1, STRIDE)
-    states: dict[int, list[Tensor]] = {horizon: [] for horizon in horizons}
-    for _ in range(NUM_DRAWS):
-        sampler = model.draw(NUM_PARTICLES, longest, generator)
-        state = observation[start].expand(NUM_PARTICLES, -1, -1).contiguous()
-        for step in range(longest):
-            state = sampler(state, action[start + step], step)
-            if step + 1 in states:
-                states[step + 1].append(state)
-    truth = {horizon: observation[start + horizon] for horizon in horizons}
-    return {horizon: torch.cat(drawn) for horizon, drawn in states.items()}, truth
+    particles: dict[int, list[Tensor]] = {horizon: [] for horizon in horizons}
+    truth: dict[int, list[Tensor]] = {horizon: [] for horizon in horizons}
+    for episode in episodes:
+        start = torch.arange(0, len(episode.action) - longest + 1, STRIDE)
+        drawn: dict[int, list[Tensor]] = {horizon: [] for horizon in horizons}
+        for _ in range(NUM_DRAWS):
+            sampler = model.draw(NUM_PARTICLES, longest, generator)
+            state = episode.observation[start].expand(NUM_PARTICLES, -1, -1).contiguous()
+            for step in range(longest):
+                state = sampler(state, episode.action[start + step], step)
+                if step + 1 in drawn:
+                    drawn[step + 1].append(state)
+        for horizon in horizons:
+            particles[horizon].append(torch.cat(drawn[horizon]))
+            truth[horizon].append(episode.next_observation[start + horizon - 1])
+    return {horizon: Forecast(torch.cat(particles[horizon], dim=1), torch.cat(truth[horizon])) for horizon in horizons}
 
 
 def scores(particles: Float[Tensor, "N K S"], truth: Float[Tensor, "K S"]) -> dict[str, float]:
@@ -58,7 +67,7 @@ def scores(particles: Float[Tensor, "N K S"], truth: Float[Tensor, "K S"]) -> di
         statistics that hold this share of a further particle; ``nll``: negative log density of the Gaussian with the
         particles' moments; ``crps``: continuous ranked probability score of the particles, E|x - y| - E|x - x'| / 2
         (Gneiting and Raftery 2007); ``rmse`` of the particles' mean; ``z2``: mean squared error over the variance.
-        Particles that are not finite count as a forecast of everything: never covered, and left out of the moments.
+        Particles that are not finite everywhere are left out; ``lost`` is their share.
     """
     finite = particles.isfinite().all(-1).all(-1)
     lost, particles = 1.0 - float(finite.double().mean()), particles[finite].double()
@@ -70,7 +79,7 @@ def scores(particles: Float[Tensor, "N K S"], truth: Float[Tensor, "K S"]) -> di
     ordered = particles.sort(0).values
     result = {}
     for level in LEVELS:
-        below = round((1.0 - level) / 2 * (count + 1))
+        below = max(round((1.0 - level) / 2 * (count + 1)), 1)
         low, high = ordered[below - 1], ordered[count - below]
         result[f"coverage_{round(100 * level)}"] = float(((truth >= low) & (truth <= high)).double().mean())
     mean, std = particles.mean(0), particles.std(0).clamp_min(FLOOR)

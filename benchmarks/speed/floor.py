@@ -51,23 +51,27 @@ def bare_step(case: Case, num_layers: int) -> Callable[[], None]:
     return step
 
 
-def bare_training(num_layers: int, batch_size: int) -> Callable[[], None]:
-    """What one training iteration cannot do without: per layer a Cholesky, four solves, four products, in float64."""
-    random = partial(torch.randn, generator=seeded(0), dtype=torch.float64)
-    matrix = random(NUM_INDUCING, NUM_INDUCING)
-    covariance = matrix @ matrix.mT + NUM_INDUCING * torch.eye(NUM_INDUCING, dtype=torch.float64)
-    right = random(NUM_INDUCING, batch_size)
+def bare_training(num_layers: int, batch_size: int, num_chains: int, num_iterations: int) -> Callable[[], None]:
+    """What training iterations of all chains, one of which moves hyperparameters, cannot do without, in float64.
 
-    def iteration() -> None:
+    Per layer and iteration the kernel's maps and the two products with L^-1 of a gradient by the inducing outputs; once
+    a Cholesky, its inverse, and the three products more of a gradient by the hyperparameters.
+    """
+    random = partial(torch.randn, generator=seeded(0), dtype=torch.float64)
+    matrix, eye = random(NUM_INDUCING, NUM_INDUCING), torch.eye(NUM_INDUCING, dtype=torch.float64)
+    covariance = (matrix @ matrix.mT + NUM_INDUCING * eye).repeat(num_chains, 1, 1)
+    right = random(num_chains, NUM_INDUCING, batch_size)
+    positive = right.abs()
+
+    def iterations() -> None:
         for _ in range(num_layers):
             factor = torch.linalg.cholesky_ex(covariance)[0]
-            for _ in range(2):  # a gradient by the inducing outputs, another by the hyperparameters
-                projected = torch.linalg.solve_triangular(factor, right, upper=False)
-                torch.linalg.solve_triangular(factor.mT, projected, upper=True)
+            inverse = torch.linalg.solve_triangular(factor, eye, upper=False)
+            for _ in range(num_iterations):
                 torch.exp(right)
-                torch.sqrt(right)
-            outer = right @ projected.mT
-            torch.linalg.solve_triangular(factor.mT, outer, upper=True)
-            torch.linalg.solve_triangular(factor, outer, upper=False, left=False)
+                torch.sqrt(positive)
+                projected = inverse @ right
+                inverse.mT @ projected
+            _ = inverse.mT @ (right @ projected.mT) @ inverse
 
-    return iteration
+    return iterations

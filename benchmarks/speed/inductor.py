@@ -17,7 +17,7 @@ def compiled_step(case: Case, model: DeepGPDynamics, data: Transitions) -> tuple
     world = model.draw(NUM_PARTICLES, case.horizon, seeded(1))
     assert isinstance(world, PathwiseSampler) and model.kernel.name == "matern32"
     layers = [
-        (layer.inverse_lengthscale, *weights, layer.kernel_out[0].mT, layer.feature_out[0].mT)
+        (layer.inverse_lengthscale.unsqueeze(1), *weights, layer.kernel_out[0].mT, layer.feature_out[0].mT)
         for layer, weights in zip(world.layers, world._in_weights, strict=True)
     ]
 

@@ -2,11 +2,9 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 
 import torch
-from gym_dgpmpc.inference.mcem import MCEM
 
 from benchmarks.rows import Row
 from benchmarks.speed import floor, peers
@@ -32,8 +30,9 @@ from benchmarks.speed.inductor import compiled_step
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.dynamics.deep_gp.start import initial_model
-from gym_dgpmpc.gp.deep_gp import factorise_all
-from gym_dgpmpc.inference import mcem, sghmc
+from gym_dgpmpc.inference import sghmc
+from gym_dgpmpc.inference.sampler import Chains, initial_state
+from gym_dgpmpc.inference.training import BURN_IN
 from gym_dgpmpc.planning.rollout import particle_returns, rollout
 
 NUM_TRANSITIONS = 600
@@ -72,28 +71,34 @@ def pets(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
 
 
 def training(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
-    """A training iteration (one SG-HMC and one Adam step), an SG-HMC step alone, and GPyTorch's training step."""
+    """A training iteration and an SG-HMC step alone, both of all chains, and GPyTorch's training step, of one model.
+
+    An iteration is the mean of 20, so that it has its share of steps of the hyperparameters, and of an exact draw.
+    """
     data, generator = transitions(case, NUM_TRANSITIONS), seeded(0)
     model = deep_gp(case, num_layers, data)
     x, y = model._encode(data)
     standardised = Data(Normaliser.fit(x)(x), Normaliser.fit(y)(y))
-    start = initial_model(model.kernel, standardised, num_layers, model.num_inducing, generator)
-    chain = sghmc.init(x.new_zeros(start.num_whitened()))
-    run = MCEM(start, chain, standardised, model.inference)
+    start = initial_model(model.kernel, standardised, num_layers, model.num_inducing, model.num_chains, generator)
+    whitened = sghmc.init(x.new_zeros(model.num_chains, start.num_whitened()))
+    state = initial_state(start, whitened, standardised.num_rows, generator)
+    together = 20
+    run = Chains(start, state, standardised, model.inference, round(BURN_IN * together * (repeats + 2)))
 
     def iterate() -> None:
-        for _ in range(20):  # so that each has its share of an exact draw
+        for _ in range(together):
             run.step(generator)
 
-    def sample() -> None:
-        without_gibbs = replace(model.inference, gibbs_every=0)
-        list(mcem.sample(factorise_all(start), chain, standardised, 1, 5, generator, without_gibbs))
-
-    row = {"what": "training iteration"}
-    yield row | {"how": "this package"} | timed(iterate, repeats, 1 / 20)
-    yield row | {"how": "bare arithmetic"} | timed(floor.bare_training(num_layers, BATCH_SIZE), repeats)
+    row, ours = {"what": "training iteration"}, {"how": "this package", "chains": model.num_chains}
+    yield row | ours | timed(iterate, repeats, 1 / together)
+    bare = floor.bare_training(num_layers, BATCH_SIZE, model.num_chains, model.inference.hyperparameters_every)
+    yield (
+        row
+        | {"how": "bare arithmetic", "chains": model.num_chains}
+        | timed(bare, repeats, 1 / model.inference.hyperparameters_every)
+    )
     yield row | {"how": "GPyTorch"} | timed(peers.gpytorch_calls(case, num_layers)["training step"], repeats)
-    yield {"what": "SG-HMC step", "how": "this package"} | timed(sample, repeats, 1 / 5)
+    yield {"what": "SG-HMC step"} | ours | timed(partial(run.step, generator, frozen=True), repeats)
     resample = partial(model.resample, data, generator)
     yield {"what": "re-sampling within an episode", "how": "this package"} | timed(resample, repeats)
 

@@ -6,7 +6,8 @@ from benchmarks.report import markdown
 from benchmarks.rows import Row, find
 
 EXTRA = (
-    "varied", "value", "extra_memory_mb", "seconds_to_compile", "product_gflops", "large_product_gflops", "by",
+    "chains", "varied", "value", "extra_memory_mb", "seconds_to_compile", "product_gflops", "large_product_gflops",
+    "by",
 )  # fmt: skip
 """What some rows have besides their times."""
 
@@ -79,8 +80,9 @@ def document(facts: Row, rows: list[Row]) -> str:
         f"{facts['load_average_1_min_after']:.1f} after; PyTorch {facts['versions']['torch']}, "
         f"revision {facts['revision']}. More versions in `speed.json`.",
         "",
-        "How many times longer the others take, by medians (the last column: this package's plan in units of the bare "
-        "products, square roots, exponentials and cosines in PyTorch):",
+        "How many times longer the others take, by medians (a training iteration moves several chains, GPyTorch's one "
+        "model; the last column: this package's plan in units of the bare products, square roots, exponentials and "
+        "cosines in PyTorch):",
         "",
         *ratios(rows),
         "",

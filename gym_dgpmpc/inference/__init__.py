@@ -1,1 +1,1 @@
-"""Sampling inducing outputs and fitting hyperparameters: SG-HMC, moving-window MCEM, chain diagnostics."""
+"""Sampling inducing outputs and hyperparameters: SG-HMC in several chains, its gradients, priors, diagnostics."""

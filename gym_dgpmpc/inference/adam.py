@@ -1,6 +1,6 @@
 """Where Adam starts: what it remembers of a parameter, made by the dtype and device of the parameter.
 
-Used by `mcem.py` and by the ensemble. PyTorch's own start takes the process's default device, which may be another.
+Used by `sampler.py` and by the ensemble. PyTorch's own start takes the process's default device, which may be another.
 """
 
 import torch

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import ablation, calibration
+from benchmarks import ablation, noise
 from benchmarks.rows import find, read_rows
 
 COMMITTED = Path(__file__).parents[2] / "benchmarks" / "results"
 RESULTS = {"return": 1.5, "coverage": float("nan"), "iterations": 4000.0}
 
 
-@pytest.fixture(params=[ablation, calibration], ids=["ablation", "calibration"])
+@pytest.fixture(params=[ablation, noise], ids=["ablation", "noise"])
 def benchmark(request, monkeypatch, tmp_path):
     """Runs a benchmark whose measurements take no time; gives what it measured."""
     name = request.param.__name__.rsplit(".", 1)[1]
@@ -43,22 +43,33 @@ def saved(benchmark):
 
 OTHERS = {
     "ablation": [("--env", "environment", "ModCartPole-v0"), ("--steps", "steps", 50)],
-    "calibration": [("--layers", "layers", 3), ("--kernel", "kernel", "rbf")],
+    "noise": [("--steps", "steps", 50), ("--gain", "gain", 0.5)],
 }
+
+EVERY = {
+    "ablation": [{"variant": variant} for variant in ablation.VARIANTS],
+    "noise": [{"model": model, "noise": kind} for model in noise.MODELS for kind in noise.NOISES],
+}
+"""What is measured with each seed, in this order."""
+
+
+def kinds(benchmark, rows):
+    """The rows' entries of `EVERY`."""
+    return [{key: row[key] for key in EVERY[benchmark.name][0]} for row in rows]
 
 
 def test_what_is_there_is_not_measured_again(benchmark):
     first = benchmark("--seeds", "100")
-    assert [row["variant"] for row in first] == list(benchmark.module.VARIANTS)
+    assert kinds(benchmark, first) == EVERY[benchmark.name]
     assert benchmark("--seeds", "100") == []
     assert {row["seed"] for row in benchmark("--seeds", "100", "101")} == {101}
 
 
 def test_an_interrupted_benchmark_goes_on(benchmark, monkeypatch):
-    whole = benchmark.module.measure
+    whole, every = benchmark.module.measure, EVERY[benchmark.name]
 
     def interrupted(wanted):
-        if wanted["variant"] == list(benchmark.module.VARIANTS)[2]:
+        if kinds(benchmark, [wanted]) == every[2:3]:
             raise KeyboardInterrupt
         return whole(wanted)
 
@@ -66,7 +77,7 @@ def test_an_interrupted_benchmark_goes_on(benchmark, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         benchmark("--seeds", "100")
     monkeypatch.setattr(benchmark.module, "measure", whole)
-    assert [row["variant"] for row in benchmark("--seeds", "100")] == list(benchmark.module.VARIANTS)[2:]
+    assert kinds(benchmark, benchmark("--seeds", "100")) == every[2:]
 
 
 def test_other_settings_are_kept_apart(benchmark):
@@ -88,7 +99,7 @@ def test_the_table_has_all_rows_and_commands(benchmark, capsys):
     page = benchmark.file.with_suffix(".md").read_text()
     about, _, header, _, *rows = page.splitlines()
     assert about.count(f"benchmarks.{benchmark.name} --seeds 100") == 2
-    assert len(rows) == 2 * len(benchmark.module.VARIANTS)
+    assert len(rows) == 2 * len(EVERY[benchmark.name])
     names, cells = ([cell.strip() for cell in line.strip("|").split("|")] for line in (header, rows[-1]))
     last = dict(zip(names, cells, strict=True))
     assert (last[column], last["seed"]) == (str(value), "100")
@@ -114,7 +125,7 @@ def test_committed_rows_count_for_the_settings_that_they_were_made_with(benchmar
     committed = saved(benchmark)
     assert benchmark("--seeds", "100") == []
     option, column, value = OTHERS[benchmark.name][0]
-    assert len(benchmark("--seeds", "100", option, str(value))) == len(benchmark.module.VARIANTS)
+    assert len(benchmark("--seeds", "100", option, str(value))) == len(EVERY[benchmark.name])
     rows = saved(benchmark)
     for old, row in zip(committed, rows, strict=False):
         assert row == row | old

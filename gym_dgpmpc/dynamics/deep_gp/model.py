@@ -188,7 +188,7 @@ class DeepGPDynamics(Learner[_Fitted]):
         self.compile = compile and dtype == torch.float32 and self.device.type == "cpu"
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
-        """Train on all transitions: moving-window MCEM, then a fresh pool of posterior samples.
+        """Train all chains on all transitions, then take a fresh pool of posterior samples from them.
 
         The first fit starts from the data, later ones from the present posterior.
 
