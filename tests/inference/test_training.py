@@ -179,7 +179,7 @@ def test_adam_takes_the_smaller_steps_after_a_rollback():
 
 
 @pytest.mark.usefixtures("unchecked")  # hundreds of steps
-@pytest.mark.parametrize("step_size", [3.0, 10.0])
+@pytest.mark.parametrize("step_size", [5.0, 10.0])
 def test_a_run_that_diverges_goes_back_and_takes_smaller_steps(step_size):
     """Steps of 10 without exact draws explode at once; what comes out is a usable model all the same.
 
