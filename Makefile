@@ -42,7 +42,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 # Smaller than the defaults, which follow the paper, in every way that costs time; it learns the task all the same.
 demo: $(INSTALLED)
 	$(BIN)/dgpmpc train ModCartPole-v0 --layers 2 --episodes 6 --seed 0 --out demo --inducing 100 --features 128 \
-	  --candidates 200 --first-training-iterations 4000 --training-iterations 1000 --resample-steps 10
+	  --candidates 200 --first-training-iterations 4000 --training-iterations 1000
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -30,7 +30,7 @@ STEPS = 12
 PLANNING = {"num_candidates": 30, "horizon": 6, "num_iterations": 2}
 DEEP_GP = {
     **PLANNING, "num_inducing": 20, "num_features": 32, "first_training_iterations": 60, "training_iterations": 30,
-    "num_samples": 10, "sample_spacing": 2, "resample_steps": 2, "num_particles": 3,
+    "num_samples": 10, "sample_spacing": 2, "resample_samples": 2, "num_particles": 3,
 }  # fmt: skip
 PETS = {**PLANNING, "num_members": 3, "num_hidden_layers": 2, "hidden_size": 16, "weight_decay": (1e-4,) * 3}
 PETS |= {"num_particles": 3}

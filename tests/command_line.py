@@ -6,7 +6,7 @@ from gym_dgpmpc import cli
 
 SMALLEST = ["--layers=1", "--inducing=4", "--features=4", "--particles=2", "--horizon=3", "--candidates=6"]
 SMALLEST += ["--iterations=1", "--first-training-iterations=2", "--training-iterations=2", "--samples=2"]
-SMALLEST += ["--sample-spacing=1", "--resample-steps=0"]
+SMALLEST += ["--sample-spacing=1", "--resample-samples=0"]
 """Options of `dgpmpc train` with which a run takes a second."""
 
 

@@ -21,7 +21,7 @@ TINY = {
     "training_iterations": 2,
     "num_samples": 4,
     "sample_spacing": 1,
-    "resample_steps": 1,
+    "resample_samples": 1,
     "num_candidates": 10,
     "num_iterations": 1,
     "horizon": 2,

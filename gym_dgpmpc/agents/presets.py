@@ -46,7 +46,6 @@ def _stock(**settings: Any) -> MappingProxyType[str, Any]:
         "training_iterations": 500,
         "num_samples": 50,
         "sample_spacing": 5,
-        "resample_steps": 2,
     }
     return MappingProxyType({**common, **settings})
 

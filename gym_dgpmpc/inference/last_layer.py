@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.deep_gp import Factorised
 from gym_dgpmpc.gp.linalg import cholesky
 from gym_dgpmpc.inference.gradients import LayerTerms, Passed
@@ -53,12 +54,17 @@ class LastLayerEvidence(NamedTuple):
         """With the standard normal prior.
 
         Raises:
-            FactorisationError: the precision is not finite, or so large that rounding hides the prior.
+            FactorisationError: the precision or the mean is not finite, or the precision so large that rounding hides
+                the prior.
         """
         prior = torch.eye(self.moment.shape[-1], dtype=self.moment.dtype, device=self.moment.device)
         # No eigenvalue lies below the prior's one, so no jitter is needed.
         factor = cholesky(self.precision + prior, self.moment.new_ones(()), jitter=0.0)
         mean = torch.cholesky_solve(self.moment.unsqueeze(-1), factor).squeeze(-1)
+        if not bool(mean.isfinite().all()):  # targets are in the moment alone
+            raise FactorisationError(
+                "the mean of the last layer's posterior is not finite: check whether all targets are, and are plausible"
+            )
         return LastLayerPosterior(mean, factor)
 
 

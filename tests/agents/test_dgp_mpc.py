@@ -20,7 +20,7 @@ TINY = {
     "training_iterations": 10,
     "num_samples": 6,
     "sample_spacing": 2,
-    "resample_steps": 1,
+    "resample_samples": 1,
     "num_particles": 3,
     "horizon": 4,
     "num_candidates": 30,

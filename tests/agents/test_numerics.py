@@ -30,7 +30,7 @@ def learned(observations, reward_scale=1.0, **arguments):
     case = Case(observations, np.full(STEPS, reward_scale), (STEPS - 1,), *bounds, reward_scale, {})
     sizes = {"num_layers": 2, "num_inducing": 6, "num_features": 8, "num_candidates": 10, "num_iterations": 2}
     sizes |= {"first_training_iterations": 30, "training_iterations": 10, "num_samples": 4, "sample_spacing": 2}
-    sizes |= {"horizon": 3, "resample_steps": 2, "learning_starts": STEPS - 3, "seed": 0}
+    sizes |= {"horizon": 3, "resample_samples": 2, "learning_starts": STEPS - 3, "seed": 0}
     env = Scripted(case)
     return DGPMPCAgent(env, **(sizes | arguments)).learn(STEPS), case, env
 

@@ -17,7 +17,7 @@ LENGTH = 12
 PLANNING = {"num_candidates": 20, "horizon": 4, "num_iterations": 2, "num_particles": 2, "seed": 0}
 DEEP_GP = {
     **PLANNING, "num_layers": 2, "num_inducing": 12, "num_features": 16, "first_training_iterations": 40,
-    "training_iterations": 10, "num_samples": 6, "sample_spacing": 2, "resample_steps": 1,
+    "training_iterations": 10, "num_samples": 6, "sample_spacing": 2, "resample_samples": 1,
 }  # fmt: skip
 PETS = {**PLANNING, "num_members": 2, "num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4)}
 GP = {**PLANNING, "num_inducing": 12, "max_training_iterations": 10}

@@ -117,6 +117,24 @@ def test_a_deep_gaussian_process_keeps_being_trained_as_it_was(schema):
     assert (found.learning_rate, found.step_size) == (0.01, 0.03 if schema == 5 else 0.02)
 
 
+@pytest.mark.parametrize(
+    ("older", "present"),
+    [
+        ({"resample_steps": 10}, {}),
+        ({"resample_steps": 10, "resample_samples": 3}, {"resample_samples": 3}),
+        ({"resample_steps": 0, "resample_samples": 3}, {"resample_samples": 0}),
+        ({"resample_samples": 3}, {"resample_samples": 3}),
+        ({}, {}),
+    ],
+)
+def test_an_agent_that_did_not_follow_its_data_within_an_episode_does_not_now(older, present):
+    """Steps of SG-HMC did so in files up to schema 5; no steps left the samples as they were."""
+    config, tensors = raw(FILES / "schema5.zip")
+    arguments = {name: value for name, value in config["arguments"].items() if not name.startswith("resample")}
+    found = upgraded(config | {"arguments": arguments | older}, tensors, 5)[0]["arguments"]
+    assert {name: value for name, value in found.items() if name.startswith("resample")} == present
+
+
 @pytest.mark.parametrize("schema", SCHEMAS)
 def test_files_of_every_schema_hold_the_posterior_that_they_held(schema, tmp_path):
     """Every number of hyperparameters, chain and pool, bit by bit; and the mean that they stand for, by the oracle.
@@ -131,7 +149,7 @@ def test_files_of_every_schema_hold_the_posterior_that_they_held(schema, tmp_pat
     for name, value in held.items():
         axis = 1 if name == "pool" else 0
         assert torch.equal(state[name], value.unsqueeze(axis) if has_chains(name) else value), name
-    assert set(state) - set(held) == {"turn", "oldest"} | ({"latents.0"} if schema == 5 else set())
+    assert set(state) - set(held) == {"oldest"} | ({"latents.0"} if schema == 5 else set())
 
     x = np.random.default_rng(0).normal(size=(6, 3))
     expected = np.mean([oracle_mean(held, flat.numpy(), x) for flat in held["pool"][:: -(-len(held["pool"]) // 2)]], 0)

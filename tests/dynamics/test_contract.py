@@ -27,9 +27,9 @@ START = torch.tensor([0.3, -0.5, slider.CONSTANT])
 HORIZON, CANDIDATES, PARTICLES = 4, 3, 10  # a multiple of the networks, more than the observation's numbers
 
 DEEP = {
-    "kernel": "rbf", "num_inducing": 24, "num_features": 512, "first_training_iterations": 300,
+    "kernel": "rbf", "num_inducing": 24, "num_features": 512, "first_training_iterations": 600,
     "training_iterations": 2,
-    "num_samples": 20, "sample_spacing": 2, "resample_steps": 2,
+    "num_samples": 20, "sample_spacing": 2, "resample_samples": 2,
 }  # fmt: skip
 NETWORKS = {"num_members": 5, "num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4)}
 

@@ -102,7 +102,7 @@ def test_joint_types_are_integers_only_where_they_must_be():
 
 def test_the_papers_agent_learns_in_one(tmp_path):
     sizes = {"num_inducing": 10, "num_features": 16, "num_samples": 5, "sample_spacing": 1, "num_particles": 2}
-    sizes |= {"first_training_iterations": 5, "resample_steps": 1, "horizon": 3, "num_candidates": 12}
+    sizes |= {"first_training_iterations": 5, "resample_samples": 1, "horizon": 3, "num_candidates": 12}
     learner = DGPMPCAgent(f"{PREFIX}FetchReachDense-v4", num_layers=1, seed=0, **sizes).learn(52)
     assert learner.dynamics.encoder.input_size == 10 + 4
     learner.save(tmp_path / "agent")

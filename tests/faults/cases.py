@@ -108,7 +108,7 @@ def cases(draw):
             "training_iterations": draw(st.integers(1, 3)),
             "num_samples": draw(st.integers(1, 4)),
             "sample_spacing": 1,
-            "resample_steps": draw(st.integers(0, 2)),
+            "resample_samples": draw(st.integers(0, 2)),
             "gibbs_every": draw(st.sampled_from([0, 1, 3])),
             "learning_starts": random_steps,
             "time_budget": draw(st.sampled_from([None, None, None, 1e-9, 1.0])),

@@ -32,7 +32,7 @@ STEPS = 20
 
 TINY = {"num_layers": 2, "num_inducing": 8, "num_features": 8, "num_particles": 2, "horizon": 4, "num_candidates": 10}
 TINY |= {"num_iterations": 2, "first_training_iterations": 20, "training_iterations": 10, "num_samples": 4}
-TINY |= {"sample_spacing": 2, "resample_steps": 2}
+TINY |= {"sample_spacing": 2, "resample_samples": 2}
 
 
 class NoisyPush(ToyPush):

@@ -90,7 +90,7 @@ AGENTS = {
             "training_iterations": 1,
             "num_samples": 1,
             "sample_spacing": 1,
-            "resample_steps": 1,
+            "resample_samples": 1,
         },
     ),
     "still": (MPCAgent, {"dynamics": still}),

@@ -31,7 +31,7 @@ TINY = {
     "first_training_iterations": 20,
     "training_iterations": 10,
     "num_samples": 5,
-    "resample_steps": 1,
+    "resample_samples": 1,
     "seed": 0,
 }
 LENGTH = 12

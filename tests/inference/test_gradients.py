@@ -9,12 +9,13 @@ from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.gp.layer import conditional
 from gym_dgpmpc.inference.gradients import (
     LEAST_VARIANCE,
+    choose,
     forward,
     gradients,
     layer_terms,
     likelihood,
-    take,
-    take_passed,
+    pass_first,
+    see,
 )
 from tests.oracles.models import chains, make_model, normal, seeded
 
@@ -74,26 +75,32 @@ def test_one_layer_has_the_gradient_of_the_closed_form_posterior(kernel):
         torch.testing.assert_close(found.whitened[chain].view(expected.shape), expected / len(y), rtol=1e-7, atol=1e-9)
 
 
-def test_what_the_first_layer_saw_may_be_given():
-    model, whitened, x, _, latents = problem(2)
-    terms, by_layer = layer_terms(factorise_all(model)), model.split(whitened)
-    passed = forward(terms, by_layer, x.expand(2, -1, -1), latents)
-    again = forward(terms, by_layer, x.expand(2, -1, -1), latents, passed[0].seen)
-    assert all(
-        torch.equal(a.mean, b.mean) and torch.equal(a.variance, b.variance) for a, b in zip(passed, again, strict=True)
-    )
+@pytest.mark.parametrize("num_layers", [1, 2])
+def test_how_points_pass_the_first_layer_may_be_given(num_layers):
+    model, whitened, x, _, latents = problem(num_layers)
+    terms, by_layer, points = layer_terms(factorise_all(model)), model.split(whitened), x.expand(2, -1, -1)
+    first = pass_first(terms, by_layer[0], see(terms[0], points))
+    passed, again = forward(terms, by_layer, points, latents), forward(terms, by_layer, points, latents, first)
+    assert again[0] is first
+    for one, other in zip(passed, again, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(numbers(one), numbers(other), strict=True))
 
 
-def test_points_may_be_taken():
-    """Some points pass as they do among others, of each chain its own."""
+def test_each_point_may_be_chosen_from_two_ways():
+    """As it passes with the latents of that way, of each chain its own."""
     model, whitened, x, _, latents = problem(3)
-    factorised, by_layer = factorise_all(model), model.split(whitened)
-    terms = layer_terms(factorised)
-    passed = forward(terms, by_layer, x.expand(2, -1, -1), latents)
-    rows = torch.tensor([[0, 3, 3, 16], [5, 2, 1, 0]])
-    some = [take_passed(layer, rows) for layer in passed]
-    chosen = torch.stack([x[each] for each in rows])
-    again = forward(terms, by_layer, chosen, [take(latent, rows) for latent in latents])
-    for one, other in zip(some, again, strict=True):
-        for a, b in zip((*one.seen, one.mean, one.variance), (*other.seen, other.mean, other.variance), strict=True):
+    others = [normal(seeded(8 + index), *latent.shape) for index, latent in enumerate(latents)]
+    terms, by_layer, points = layer_terms(factorise_all(model)), model.split(whitened), x.expand(2, -1, -1)
+    mask = torch.rand(2, 17, generator=seeded(5)) < 0.5
+    mixed = [torch.where(mask.unsqueeze(-1), *pair) for pair in zip(latents, others, strict=True)]
+    ways = [forward(terms, by_layer, points, each) for each in (latents, others, mixed)]
+    for one, other, expected in zip(*ways, strict=True):
+        found = choose(mask, one, other)
+        # The same sums, whose order may depend on where a point stands.
+        for a, b in zip(numbers(found), numbers(expected), strict=True):
             torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-10)
+
+
+def numbers(passed):
+    """All of a layer's, in one tuple."""
+    return *passed.seen, passed.mean, passed.variance

@@ -11,8 +11,9 @@ from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.gp.layer import Layer, conditional, project
 from gym_dgpmpc.inference import sghmc
 from gym_dgpmpc.inference.gradients import forward, layer_terms
-from gym_dgpmpc.inference.last_layer import last_layer_posterior
-from gym_dgpmpc.inference.sampler import Chains, InferenceSettings, initial_state
+from gym_dgpmpc.inference.last_layer import last_layer_evidence
+from gym_dgpmpc.inference.sampler import Chains, initial_state
+from gym_dgpmpc.inference.settings import InferenceSettings
 from tests.oracles.models import chains, normal, seeded
 
 M, D, T, N = 7, 2, 3, 30
@@ -45,7 +46,7 @@ def posterior(model, whitened, data, latents=(), weight=1.0):
     factorised = factorise_all(model)
     terms = layer_terms(factorised)
     passed = forward(terms, model.split(whitened), data.x.expand(len(whitened), -1, -1), latents)
-    return last_layer_posterior(factorised, terms[-1], passed[-1], data.y, weight)
+    return last_layer_evidence(factorised, terms[-1], passed[-1], data.y, weight).posterior()
 
 
 def started(model, data, generator, **settings):
@@ -102,6 +103,16 @@ def test_a_precision_that_rounding_spoils_is_an_error(generator):
     model, data = chains(deep_gp(1, generator, "rbf")), toy(generator)
     with pytest.raises(FactorisationError):
         posterior(model, torch.zeros(1, M * T).double(), Data(data.x[:2], data.y[:2]), weight=1e19)
+
+
+@pytest.mark.parametrize("field", ["x", "y"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_data_that_are_not_finite_are_an_error(field, value, generator):
+    """Of one target of one chain's datum, too; never a posterior of which a part is not finite."""
+    model, data = chains(*(deep_gp(1, generator) for _ in range(2))), toy(generator)
+    getattr(data, field)[3, 1] = value
+    with pytest.raises(FactorisationError, match="finite"):
+        posterior(model, torch.zeros(2, M * T).double(), data)
 
 
 @pytest.mark.parametrize("num_chains", [1, 2])

@@ -15,7 +15,8 @@ from gym_dgpmpc.gp.layer import conditional
 from gym_dgpmpc.inference import sampler, sghmc
 from gym_dgpmpc.inference.diagnostics import effective_sample_size
 from gym_dgpmpc.inference.gradients import forward, gradients, layer_terms
-from gym_dgpmpc.inference.sampler import LAST_LEARNING_RATE, Chains, InferenceSettings, initial_state
+from gym_dgpmpc.inference.sampler import LAST_LEARNING_RATE, Chains, initial_state
+from gym_dgpmpc.inference.settings import InferenceSettings
 from tests.oracles import sghmc as oracle
 from tests.oracles.models import chains, make_model, normal, seeded
 
@@ -197,13 +198,6 @@ def test_the_prior_weighs_less_the_more_data_there_are(seen_gradients):
     torch.testing.assert_close(found[0] - found[1], v * (1 / 8 - 1 / 80), rtol=1e-9, atol=1e-10)
 
 
-def uncertain(model):
-    """With an inner layer that leaves much to its latents, of which the data then say something."""
-    inner, last = model.layers
-    inner = inner._replace(log_variance=torch.zeros_like(inner.log_variance), log_lengthscale=inner.log_lengthscale - 2)
-    return model._replace(layers=(inner, last), log_noise=torch.full_like(model.log_noise, math.log(0.02)))
-
-
 @pytest.mark.parametrize(("batch_size", "share"), [(8, 0.2), (50, 0.5), (200, 1.0), (1000, 1.0)])
 def test_steps_shrink_with_the_root_of_the_share_of_the_data_in_a_minibatch(batch_size, share, seen_gradients):
     models, data = one_layer(num_data=200)
@@ -211,61 +205,6 @@ def test_steps_shrink_with_the_root_of_the_share_of_the_data_in_a_minibatch(batc
     started(models, data, settings).step(seeded())
     sizes = [kwargs["step_size"] for *_, kwargs in seen_gradients]
     assert sizes == pytest.approx([share * 0.1, share * settings.hyperparameter_step_size], rel=1e-12)
-
-
-def test_a_datums_latents_settle_in_their_conditional_law():
-    """Against quadrature over the one latent of a datum; 3000 rows that are the same are as many independent chains.
-
-    Two chains of them, under hyperparameters and inducing outputs of their own.
-    """
-    generator = seeded(3)
-    models = [uncertain(make_model(2, 1, 1, 6, generator, "matern32")) for _ in range(2)]
-    together, num = chains(*models), 3000
-    whitened = 1.5 * normal(generator, 2, together.num_whitened())
-    x, y = torch.tensor([[0.4]], dtype=torch.float64), torch.tensor([[0.8]], dtype=torch.float64)
-    factorised, data = factorise_all(together), Data(x.repeat(num, 1), y.repeat(num, 1))
-    terms, latents = layer_terms(factorised), [normal(generator, 2, num, 1)]
-    for _ in range(100):
-        _, latents = sampler.move_latents(factorised, terms, together.split(whitened), data, latents, generator)
-    nodes, weights = (torch.from_numpy(part) for part in np.polynomial.hermite_e.hermegauss(200))
-    for c, model in enumerate(models):
-        factors, split = factorise_all(model).factors, model.split(whitened[c])
-        mean, variance = conditional(model.layers[0], factors[0], split[0], x)
-        hidden = x + mean + variance.sqrt().unsqueeze(-1) * nodes.unsqueeze(1)
-        last_mean, last_variance = conditional(model.layers[1], factors[1], split[1], hidden)
-        std = (last_variance + model.noise_variance).sqrt()
-        law = weights * torch.distributions.Normal(last_mean.squeeze(1), std).log_prob(y.squeeze(1)).exp()
-        law = law / law.sum()
-        first = float(law @ nodes)
-        second, fourth = (float(law @ (nodes - first) ** power) for power in (2, 4))
-        assert abs(first) > 0.2 or abs(second - 1.0) > 0.2, "the datum says something of its latent"
-        found = latents[0][c, :, 0]
-        assert found.mean().item() == pytest.approx(first, abs=5 * math.sqrt(second / num))
-        assert found.var().item() == pytest.approx(second, abs=5 * math.sqrt((fourth - second**2) / num))
-
-
-def test_moved_points_are_those_of_the_moved_latents():
-    models, data = two_layers()
-    model = chains(*map(uncertain, models))
-    factorised, generator = factorise_all(model), seeded(4)
-    terms, whitened = layer_terms(factorised), model.split(normal(generator, 2, model.num_whitened()))
-    before = [normal(generator, 2, 9, 2)]
-    passed, after = sampler.move_latents(factorised, terms, whitened, data, before, generator)
-    accepted = (after[0] != before[0]).any(-1)
-    assert accepted.any() and not accepted.all()
-    for one, other in zip(passed, forward(terms, whitened, data.x.expand(2, -1, -1), after), strict=True):
-        for a, b in zip((*one.seen, one.mean, one.variance), (*other.seen, other.mean, other.variance), strict=True):
-            torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-10)
-
-
-def test_latents_of_new_rows_are_drawn_and_the_others_stay():
-    latents = [normal(seeded(1), 2, 3, 4), normal(seeded(2), 2, 3, 4)]
-    grown = sampler.with_latents(latents, 5000, seeded())
-    for old, new in zip(latents, grown, strict=True):
-        assert new.shape == (2, 5000, 4) and torch.equal(new[:, :3], old)
-        assert new.std().item() == pytest.approx(1.0, abs=5 / math.sqrt(2 * 40_000))
-    assert abs(float(torch.stack([grown[0].flatten(), grown[1].flatten()]).corrcoef()[0, 1])) < 5 / math.sqrt(40_000)
-    assert all(torch.equal(a, b) for a, b in zip(sampler.with_latents(latents, 3, seeded()), latents, strict=True))
 
 
 @pytest.mark.parametrize("hyperparameters", ["sampled", "optimised"])
@@ -410,26 +349,3 @@ def test_the_last_layer_is_drawn_as_often_as_asked(monkeypatch, every, drawn, nu
     positions = list(sampler.sample(run, 4, 2, generator))
     assert len(seen) == (4 if every else 0)
     assert torch.stack(positions).shape == (4, num_chains, 10)
-
-
-@pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize(
-    ("name", "good", "bad"),
-    [
-        ("decay", (0.0, 1.0), (-1e-9, 1.0 + 1e-9)),
-        ("step_size", (1e-300, 10.0), (0.0, -1.0, float("inf"), float("nan"))),
-        ("hyperparameter_step_size", (1e-300, 10.0), (0.0, -1.0, float("inf"), float("nan"))),
-        ("learning_rate", (1e-300, 10.0), (0.0, -1.0, float("inf"), float("nan"))),
-        ("gibbs_every", (0, 1), (-1,)),
-        ("patience", (None, 1), (0,)),
-        ("window_size", (1,), (0,)),
-        ("hyperparameters_every", (1,), (0,)),
-        ("hyperparameters", ("sampled", "optimised"), ("fixed",)),
-    ],
-)
-def test_settings_have_ranges_of_which_the_ends_are_told(name, good, bad):
-    for value in good:
-        assert getattr(InferenceSettings(**{name: value}), name) == value
-    for value in bad:
-        with pytest.raises(ValueError, match=rf"{name} .*{value}"):
-            InferenceSettings(**{name: value})

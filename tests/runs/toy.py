@@ -19,7 +19,7 @@ SMALLEST_AGENT = {
     "training_iterations": 2,
     "num_samples": 2,
     "sample_spacing": 1,
-    "resample_steps": 0,
+    "resample_samples": 0,
 }
 
 

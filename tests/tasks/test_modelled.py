@@ -165,7 +165,7 @@ class Balance(gym.Env):
 
 def test_deep_gp_learns_when_an_episode_ends_and_keeps_it_from_ending():
     sizes = {"num_inducing": 15, "first_training_iterations": 200, "training_iterations": 25, "num_layers": 1}
-    learner = DGPMPCAgent(Balance(), **{**TINY, **sizes, "learning_starts": 60, "horizon": 6, "resample_steps": 0})
+    learner = DGPMPCAgent(Balance(), **{**TINY, **sizes, "learning_starts": 60, "horizon": 6, "resample_samples": 0})
     learner.learn(145)
     assert learner.task.modelled.reward and learner.task.modelled.terminated
     assert learner.dynamics.encoder.target_size == 3 and learner.dynamics.encoder.input_size == 2

@@ -8,7 +8,8 @@ import torch
 from gym_dgpmpc.dynamics.deep_gp import start as deep_gp_start
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.errors import TrainingError
-from gym_dgpmpc.inference.sampler import InferenceSettings
+from gym_dgpmpc.inference.following import BLOCK
+from gym_dgpmpc.inference.settings import InferenceSettings
 from gym_dgpmpc.planning.rollout import rollout
 from gym_dgpmpc.types import DynamicsModel, ObservationSpec, Transitions
 from tests.oracles import pendulum
@@ -16,7 +17,7 @@ from tests.oracles.models import seeded
 
 TINY = {
     "num_inducing": 8, "num_features": 16, "first_training_iterations": 3, "training_iterations": 2, "num_chains": 2,
-    "num_samples": 8, "sample_spacing": 1, "resample_steps": 2,
+    "num_samples": 8, "sample_spacing": 1, "resample_samples": 2,
 }  # fmt: skip
 
 
@@ -111,34 +112,32 @@ def test_an_unfitted_model_says_so(verb):
             tiny().resample(pendulum.simulate(3), seeded())
 
 
-@pytest.mark.parametrize("num_chains", [1, 2, 3])
+@pytest.mark.parametrize("num_chains", [1, 3])
 @pytest.mark.parametrize("gibbs_every", [20, 0])
-def test_resampling_replaces_the_oldest_rows_of_the_pool_and_nothing_else(gibbs_every, num_chains):
-    """Of one chain, of all in turn."""
-    num = 3 if gibbs_every else 1  # SG-HMC alone gives one position
-    settings = {"num_chains": num_chains, "num_samples": 4 * num_chains, "resample_samples": 3}
+@pytest.mark.parametrize(("asked", "replaced"), [(3, 3), (9, 4)])
+def test_resampling_replaces_the_oldest_rows_of_the_pool_and_nothing_else(asked, replaced, gibbs_every, num_chains):
+    """Of every chain, all of them at most, however the chains were trained."""
+    settings = {"num_chains": num_chains, "num_samples": 4 * num_chains, "resample_samples": asked}
     model, generator = fitted(**settings, gibbs_every=gibbs_every), seeded(3)
     before = {name: torch.as_tensor(value).clone() for name, value in model.state_dict().items()}
-    oldest = [0] * num_chains
-    for count in range(1, 3 * num_chains + 3):  # around the rings of four and further
-        chain = (count - 1) % num_chains
-        model.resample(pendulum.simulate(30 + count), generator)
+    inner, oldest = 4 * 8, 0
+    for count in range(1, 6):  # around the ring of four and further, past 32 rows
+        assert model.resample(pendulum.simulate(30 + count), generator) == {"resamplings_dropped": 0.0}
         state = model.state_dict()
-        changed = (state["pool"] != before["pool"]).any(dim=2).nonzero().tolist()
-        assert changed == [[row, chain] for row in sorted((oldest[chain] + i) % 4 for i in range(num))]
-        newest = (oldest[chain] + num - 1) % 4
-        oldest[chain] = (oldest[chain] + num) % 4
-        assert (state["oldest"], state["turn"]) == (oldest[-1], count % num_chains)
-        assert torch.equal(state["pool"][newest, chain], state["chain.position"][chain])
+        rows = sorted((oldest + index) % 4 for index in range(replaced))
+        changed = (state["pool"] != before["pool"]).any(dim=2)
+        assert changed.nonzero().tolist() == [[row, chain] for row in rows for chain in range(num_chains)]
+        newest, oldest = (oldest + replaced - 1) % 4, (oldest + replaced) % 4
+        assert state["oldest"] == oldest
+        assert torch.equal(state["pool"][newest], state["chain.position"])
         moved = {name for name, value in before.items() if not torch.equal(torch.as_tensor(state[name]), value)}
-        assert moved - {"oldest", "turn"} == {"pool", "chain.position", "chain.momentum", "latents.0"}
-        others = [other for other in range(num_chains) if other != chain]
-        for name in ("chain.position", "chain.momentum"):
-            assert torch.equal(state[name][others], before[name][others])
-        # New rows have latents of every chain; those of the old rows are moved of the one that goes on.
-        latents, known = state["latents.0"], before["latents.0"]
+        assert moved - {"oldest"} == {"pool", "chain.position", "latents.0"}
+        # Of the inner layers every new sample has what the chain has.
+        position = before["chain.position"][:, :inner]
+        assert torch.equal(state["chain.position"][:, :inner], position)
+        assert torch.equal(state["pool"][rows][..., :inner], position.expand(replaced, -1, -1))
+        latents = state["latents.0"]
         assert latents.shape == (num_chains, 30 + count, 4) and latents.dtype == torch.float32
-        assert torch.equal(latents[others, : known.shape[1]], known[others])
         before = {name: torch.as_tensor(value).clone() for name, value in state.items()}
 
 
@@ -170,10 +169,13 @@ def test_particles_are_spread_over_the_chains_and_then_over_their_samples():
 
 
 def test_resampling_may_be_turned_off():
-    model = fitted(resample_steps=0)
-    before = model.state_dict()["pool"].clone()
-    assert model.resample(pendulum.simulate(31), seeded()) == {}
-    assert torch.equal(model.state_dict()["pool"], before)
+    model, generator = fitted(resample_samples=0), seeded()
+    before = {name: torch.as_tensor(value).clone() for name, value in model.state_dict().items()}
+    assert model.resample(pendulum.simulate(31), generator) == {}
+    after = model.state_dict()
+    assert set(after) == set(before)
+    assert all(torch.equal(torch.as_tensor(after[name]), value) for name, value in before.items())
+    assert torch.equal(generator.get_state(), seeded().get_state()), "nothing was drawn"
 
 
 def test_a_state_that_was_taken_does_not_change_with_the_model():
@@ -226,6 +228,45 @@ def test_each_particle_has_the_hyperparameters_of_its_chain():
         assert torch.equal(still, chain == 1)
 
 
+@pytest.mark.parametrize("num_layers", [1, 2, 3])
+@pytest.mark.parametrize("loaded_at", [31, 32, 33, 64])
+def test_one_loaded_within_an_episode_goes_on_bit_by_bit(loaded_at, num_layers):
+    """Wherever the rows stand to the blocks that are summed once and for all; and through the next fit."""
+    model, other = fitted(num_layers=num_layers), tiny(num_layers=num_layers)
+    generator = seeded(4)
+    for num_rows in range(31, loaded_at + 1):
+        model.resample(pendulum.simulate(num_rows), generator)
+    state = {name: torch.as_tensor(value).clone() for name, value in model.state_dict().items()}
+    other.load_state_dict(state | {"oldest": int(state["oldest"])})
+    again = torch.Generator()
+    again.set_state(generator.get_state())
+    for num_rows in range(loaded_at + 1, loaded_at + 4):
+        for each, chance in ((model, generator), (other, again)):
+            assert each.resample(pendulum.simulate(num_rows), chance) == {"resamplings_dropped": 0.0}
+        assert torch.equal(predictions(model, num_particles=8), predictions(other, num_particles=8))
+    states = model.state_dict(), other.state_dict()
+    assert all(torch.equal(*(torch.as_tensor(each[name]) for each in states)) for name in states[0])
+    model.fit(pendulum.simulate(loaded_at + 4), generator)
+    other.fit(pendulum.simulate(loaded_at + 4), again)
+    assert torch.equal(predictions(model), predictions(other))
+
+
+@pytest.mark.parametrize("renew", ["fit", "load_state_dict"])
+def test_what_was_followed_before_is_forgotten_with_a_new_posterior(renew):
+    """Sums under the hyperparameters of the fit before would say nothing of the present ones."""
+    model, fresh = fitted(), tiny()
+    for num_rows in (31, 40):  # so that a block is summed
+        model.resample(pendulum.simulate(num_rows), seeded(num_rows))
+    if renew == "fit":
+        model.fit(pendulum.simulate(45), seeded(7))
+    else:
+        model.load_state_dict(fitted(44).state_dict())
+    fresh.load_state_dict(model.state_dict())
+    for each in (model, fresh):
+        each.resample(pendulum.simulate(46), seeded(8))
+    assert torch.equal(predictions(model), predictions(fresh))
+
+
 @pytest.mark.parametrize("draw", ["pathwise", "joint", "marginal"])
 def test_a_loaded_model_draws_what_the_saved_one_does(draw):
     model, other = fitted(draw=draw), tiny(draw=draw)
@@ -270,7 +311,7 @@ def test_the_state_of_another_model_is_refused(settings, name, expected, receive
 
 
 @pytest.mark.parametrize(
-    "name", ["pool", "oldest", "turn", "log_noise", "inputs.std", "chain.square", "layers.1.log_variance", "latents.0"]
+    "name", ["pool", "oldest", "log_noise", "inputs.std", "chain.square", "layers.1.log_variance", "latents.0"]
 )
 @pytest.mark.parametrize("value", [None, "text", torch.zeros(3, 3)])
 def test_a_missing_or_damaged_entry_is_named(name, value):
@@ -280,12 +321,6 @@ def test_a_missing_or_damaged_entry_is_named(name, value):
         del state[name]
     with pytest.raises(ValueError, match=f"'{name}'"):
         tiny().load_state_dict(state)
-
-
-@pytest.mark.parametrize("turn", [-1, 2])
-def test_a_chain_that_there_is_not_is_refused(turn):
-    with pytest.raises(ValueError, match=rf"'turn'.*\b1\b.* {turn}$"):
-        tiny().load_state_dict(fitted().state_dict() | {"turn": turn})
 
 
 def test_a_state_without_latents_of_its_rows_has_them_drawn():
@@ -316,9 +351,7 @@ def test_a_position_outside_the_ring_is_refused(oldest):
         ({"training_iterations": 0}, "training_iterations .* 0$"),
         ({"num_samples": 0}, "num_samples .* 0$"),
         ({"sample_spacing": 0}, "sample_spacing .* 0$"),
-        ({"resample_samples": 0}, "resample_samples .* 0$"),
-        ({"resample_samples": -3}, "resample_samples .* -3$"),
-        ({"resample_steps": -1}, "resample_steps .* -1$"),
+        ({"resample_samples": -1}, "resample_samples .* -1$"),
         ({"batch_size": 0}, "batch_size .* 0$"),
         ({"patience": 0}, "patience .* 0$"),
         ({"step_size": 0.0}, r"step_size .* 0\.0$"),
@@ -357,32 +390,32 @@ def test_a_training_that_diverges_leaves_the_model_as_it_was():
     assert torch.equal(predictions(model), before)
 
 
-@pytest.mark.parametrize("gibbs_every", [20, 0])
-def test_a_resampling_that_diverges_is_dropped(gibbs_every):
-    model = fitted(gibbs_every=gibbs_every, resample_steps=50)
-    before, step_size = predictions(model, num_particles=8), model._fitted.step_size
-    model._fitted = model._fitted._replace(step_size=1e4)
-    assert model.resample(pendulum.simulate(31), seeded()) == {"resamplings_dropped": 1.0}
-    assert torch.equal(predictions(model, num_particles=8), before)
-    model._fitted = model._fitted._replace(step_size=step_size)
-    assert model.resample(pendulum.simulate(31), seeded()) == {"resamplings_dropped": 0.0}
-    assert not torch.equal(predictions(model, num_particles=8), before)
+@pytest.mark.parametrize("field", ["observation", "next_observation"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_resampling_that_cannot_be_computed_is_dropped(field, value):
+    """And the samples stay; the next one is that of a model that never met the data."""
+    model, unspoilt = fitted(), fitted()
+    before = {name: torch.as_tensor(value).clone() for name, value in model.state_dict().items()}
+    bad = pendulum.simulate(35)
+    getattr(bad, field)[33, 1] = value
+    assert model.resample(bad, seeded()) == {"resamplings_dropped": 1.0}
+    after = model.state_dict()
+    assert all(torch.equal(torch.as_tensor(after[name]), value) for name, value in before.items())
+    for each in (model, unspoilt):
+        assert each.resample(pendulum.simulate(36), seeded(1)) == {"resamplings_dropped": 0.0}
+    assert torch.equal(predictions(model, num_particles=8), predictions(unspoilt, num_particles=8))
+    assert not torch.equal(model.state_dict()["pool"], before["pool"])
 
 
-def test_resampling_takes_the_steps_that_training_had_to_make_smaller():
-    """Those asked for diverge each time, and the pool would stay as it is for a whole episode."""
-    settings = {"step_size": 32.0, "first_training_iterations": 300, "resample_steps": 10}
+def test_a_step_size_that_training_had_to_make_smaller_is_kept():
+    settings = {"step_size": 32.0, "first_training_iterations": 300}
     model = tiny(**settings)
     metrics = model.fit(pendulum.simulate(40), seeded())
     assert metrics["rollbacks"] >= 1
     assert model.state_dict()["step_size"] <= 32.0 / 2 ** metrics["rollbacks"]
     loaded = tiny(**settings)
     loaded.load_state_dict(model.state_dict())
-    for each in (model, loaded):
-        generator = seeded(3)
-        dropped = [each.resample(pendulum.simulate(41 + i), generator)["resamplings_dropped"] for i in range(10)]
-        assert sum(dropped) < 5
-    assert torch.equal(predictions(loaded), predictions(model))
+    assert loaded.state_dict()["step_size"] == model.state_dict()["step_size"]
 
 
 def test_a_state_without_a_step_size_has_the_one_asked_for():
@@ -398,14 +431,20 @@ def test_a_state_without_a_step_size_has_the_one_asked_for():
             model.load_state_dict(state | {"step_size": value})
 
 
-def test_resampling_encodes_the_rows_it_needs_and_no_others():
-    """Its cost does not grow with the data: of 10,000 transitions it looks at a few minibatches."""
-    model, seen = fitted(batch_size=16, gibbs_rows=32), []
+@pytest.mark.parametrize("num_layers", [1, 2])
+def test_resampling_encodes_the_rows_it_needs_and_no_others(num_layers):
+    """Its cost does not grow with the data: after the first time it looks at the newest block alone."""
+    model, generator, seen = fitted(num_layers=num_layers), seeded(), []
     encode = model._encode
-    model._encode = lambda data: seen.append(len(data.action)) or encode(data)
     many = Transitions(*(field.repeat(400, 1)[:10_000] for field in pendulum.simulate(30)))
-    model.resample(many, seeded())
-    assert seen == [16, 16, 32]
+    model.resample(many, generator)
+    model._encode = lambda data: seen.append(len(data.action)) or encode(data)
+    for count in range(1, 40):
+        data = Transitions(*(torch.cat([field, field[:count]]) for field in many))
+        seen.clear()
+        model.resample(data, generator)
+        # For the moves of the latents and for the sums; those of a block that has become whole, and of the rest.
+        assert sum(seen) <= 2 * BLOCK
 
 
 def test_clustering_looks_at_a_bounded_number_of_rows(monkeypatch):
