@@ -12,7 +12,6 @@ def _paper(horizon: int, num_iterations: int, actions_per_plan: int) -> MappingP
             "num_candidates": 300,
             "num_elites": 30,
             "num_particles": 5,
-            "num_inducing": 200,
             "horizon": horizon,
             "num_iterations": num_iterations,
             "actions_per_plan": actions_per_plan,
@@ -39,30 +38,16 @@ PAPER = MappingProxyType(
 
 def _stock(**settings: Any) -> MappingProxyType[str, Any]:
     """Of a task of Gymnasium's own: what all have in common, and ``settings``."""
-    common = {
-        "num_layers": 2,
-        "num_particles": 5,
-        "first_training_iterations": 1500,
-        "training_iterations": 500,
-        "num_samples": 50,
-        "sample_spacing": 5,
-    }
-    return MappingProxyType({**common, **settings})
+    return MappingProxyType({"num_layers": 2, "num_particles": 5, **settings})
 
 
 STOCK = MappingProxyType(
     {
-        "Pendulum-v1": _stock(
-            num_inducing=100, horizon=30, num_candidates=300, num_iterations=5, num_samples=100, sample_spacing=10
-        ),
-        "InvertedPendulum-v5": _stock(
-            num_inducing=100, horizon=15, num_candidates=200, num_iterations=5, learning_starts=150
-        ),
-        "InvertedDoublePendulum-v5": _stock(
-            num_inducing=100, horizon=12, num_candidates=300, num_iterations=5, learning_starts=200
-        ),
-        "Reacher-v5": _stock(num_inducing=100, horizon=15, num_candidates=200, num_iterations=4, learning_starts=150),
-        "Swimmer-v5": _stock(num_inducing=100, horizon=20, num_candidates=200, num_iterations=4, actions_per_plan=2),
+        "Pendulum-v1": _stock(horizon=30, num_candidates=300, num_iterations=5),
+        "InvertedPendulum-v5": _stock(horizon=15, num_candidates=200, num_iterations=5, learning_starts=150),
+        "InvertedDoublePendulum-v5": _stock(horizon=12, num_candidates=300, num_iterations=5, learning_starts=200),
+        "Reacher-v5": _stock(horizon=15, num_candidates=200, num_iterations=4, learning_starts=150),
+        "Swimmer-v5": _stock(horizon=20, num_candidates=200, num_iterations=4, actions_per_plan=2),
         "FetchReachDense-v4": _stock(
             num_inducing=64, horizon=8, num_candidates=100, num_iterations=3, learning_starts=100
         ),
@@ -137,12 +122,7 @@ PETS = MappingProxyType({env_id: _published(env_id) for env_id in _NETWORKS})
 """The settings of Chua et al. (2018), for `PETSAgent`: networks, their training, and planning."""
 
 COMPARISON_PETS = MappingProxyType(
-    {
-        env_id: MappingProxyType(
-            {**networks, **{name: value for name, value in PAPER[env_id].items() if name != "num_inducing"}}
-        )
-        for env_id, networks in _NETWORKS.items()
-    }
+    {env_id: MappingProxyType({**networks, **PAPER[env_id]}) for env_id, networks in _NETWORKS.items()}
 )
 """`PETSAgent` as in the comparison of Gadd et al.: PETS's networks, their planning, and one particle per network."""
 

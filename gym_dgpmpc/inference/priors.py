@@ -12,10 +12,12 @@ from torch import Tensor
 
 from gym_dgpmpc.gp.deep_gp import DeepGP
 
-WIDTH = 1.5
+WIDTH = 3.0
 
 LARGEST = 15.0
 """Of the logarithm of a variance that is plausible, ten standard deviations from the centre: three million."""
+
+INDUCING_WIDTH = 10.0
 
 INNER_VARIANCE = 0.01
 NOISE_VARIANCE = 0.05
@@ -44,7 +46,7 @@ def log_prior_gradient(model: DeepGP) -> list[Tensor]:
         last = index == len(model.layers) - 1
         centre = log_lengthscale_centre(layer.inducing_inputs.shape[-1])
         by_parameter += [
-            -layer.inducing_inputs,
+            -layer.inducing_inputs / INDUCING_WIDTH**2,
             (centre - layer.log_lengthscale) / WIDTH**2,
             (log_variance_centre(last=last) - layer.log_variance) / WIDTH**2,
         ]

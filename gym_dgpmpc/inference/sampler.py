@@ -95,12 +95,21 @@ class Chains:
         num_burn_in: iterations in which Adam moves the hyperparameters, and the preconditioner of the inducing outputs
             adapts. After them that stays, since one that follows the chain makes it wander too far, and "sampled"
             hyperparameters are moved by SG-HMC, "optimised" ones by Adam as before.
+        settled: the hyperparameters come from a training before, so that Adam begins with its last learning rate.
     """
 
     def __init__(
-        self, model: DeepGP, state: ChainState, data: DataSource, settings: InferenceSettings, num_burn_in: int
+        self,
+        model: DeepGP,
+        state: ChainState,
+        data: DataSource,
+        settings: InferenceSettings,
+        num_burn_in: int,
+        *,
+        settled: bool = False,
     ):
         self._kernels, self.data, self.settings, self._num_burn_in = model, data, settings, num_burn_in
+        self._settled = settled
         self.state = state
         self._flat = state.parameters.position.clone()
         self._optimiser = torch.optim.Adam([self._flat], lr=settings.learning_rate)
@@ -149,7 +158,7 @@ class Chains:
             state.whitened.position / num_data - current.whitened,
             num_data,
             generator,
-            step_size=step_sizes(state.whitened, settings.step_size, settings.decay, batch.num_rows, num_data),
+            step_size=self._step_sizes(state.whitened, settings.step_size, batch.num_rows),
             decay=settings.decay,
             burn_in=self.iteration < self._num_burn_in,
         )
@@ -165,12 +174,17 @@ class Chains:
             self._move_parameters(flatten(current.parameters), batch.num_rows, generator)
 
     def draw_last_layer(self, generator: torch.Generator) -> None:
-        """Draw the last layer's inducing outputs exactly, given all else, and bring them to rest there."""
-        whitened, inner = self.state.whitened, self.factorised.model.num_inner()
-        momentum = whitened.momentum.clone()
-        momentum[:, inner:] = 0.0
+        """Draw the last layer's inducing outputs exactly, given all else, and a momentum from its own law."""
+        whitened, inner, num_data = self.state.whitened, self.factorised.model.num_inner(), self.data.num_rows
+        size = self._step_sizes(whitened, self.settings.step_size, min(self.settings.batch_size, num_data))
+        noise = torch.randn(size.shape, generator=generator, dtype=size.dtype, device=size.device)
+        momentum = noise * size * (whitened.inverse_mass() / num_data).sqrt()
+        momentum[:, :inner] = whitened.momentum[:, :inner]
         position = self.last_layer_draws(1, generator)[0]
         self.state = self.state._replace(whitened=whitened._replace(position=position, momentum=momentum))
+
+    def _step_sizes(self, state: SGHMCState, step_size: float, batch_size: int) -> Float[Tensor, "C V"]:
+        return step_sizes(state, step_size, self.settings.decay, batch_size, self.data.num_rows)
 
     def last_layer_draws(self, num_samples: int, generator: torch.Generator) -> Float[Tensor, "n C V"]:
         """Positions that share the chains' inner layers, each with its own exact draw of the last layer."""
@@ -254,16 +268,14 @@ class Chains:
                 gradient,
                 num_data,
                 generator,
-                step_size=step_sizes(
-                    parameters, settings.hyperparameter_step_size, settings.decay, batch_size, num_data
-                ),
+                step_size=self._step_sizes(parameters, settings.hyperparameter_step_size, batch_size),
                 decay=settings.decay,
                 burn_in=True,
             )
         else:
             parameters = sghmc.adapt(parameters, gradient)
-            done = self.iteration / max(self._num_burn_in, 1)
-            self._optimiser.param_groups[0]["lr"] = settings.learning_rate * LAST_LEARNING_RATE ** min(done, 1.0)
+            done = 1.0 if self._settled else min(self.iteration / max(self._num_burn_in, 1), 1.0)
+            self._optimiser.param_groups[0]["lr"] = settings.learning_rate * LAST_LEARNING_RATE**done
             self._flat.copy_(parameters.position)
             self._flat.grad = gradient
             self._optimiser.step()
@@ -303,8 +315,9 @@ def step_sizes(
 
     A coordinate's potential has the curvature (N sd(g))^2, and a mass of sd(g), so that it turns by eps^2 N sd(g) a
     step, squared; the samples' variance is too large by a quarter of that. The noise of a minibatch adds
-    eps^2 N sd(g) / 2 m times the variance that SG-HMC injects (eps^4 M^-2 var(g) to 2 eps^2 m M^-1 / N). So one bound on
-    eps^2 N sd(g) serves for both. Coordinates that the data say little about keep long steps, which they need to mix.
+    eps^2 N sd(g) / 2 m times the variance that SG-HMC injects (eps^4 M^-2 var(g) to 2 eps^2 m M^-1 / N). So one bound
+    on eps^2 N sd(g) serves for both. Coordinates that the data say little about keep long steps, which they need to
+    mix.
     """
     most = MOST_TURNED
     if batch_size < num_data:

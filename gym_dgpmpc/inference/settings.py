@@ -21,10 +21,11 @@ class InferenceSettings:
         step_size: step size of SG-HMC for inducing outputs, epsilon; twice the value of Havasi et al., see
             docs/deviations.md.
         decay: friction of SG-HMC, m, in [0, 1].
-        hyperparameters: "sampled" with the inducing outputs, after a first half of the training that optimises them;
-            "optimised", as in the paper, gives one value for each chain and no prior.
+        hyperparameters: "optimised", as in the paper: one value for each chain, without a prior; or "sampled" with the
+            inducing outputs, under wide priors, after a burn-in that optimises them.
         hyperparameter_step_size: step size of SG-HMC for hyperparameters and inducing inputs.
-        learning_rate: learning rate of Adam, for hyperparameters and inducing inputs, at the start.
+        learning_rate: learning rate of Adam, for hyperparameters and inducing inputs, at the start of the first
+            training; it falls to a sixth, where later ones begin.
         hyperparameters_every: iterations for each step of the hyperparameters.
         window_size: latest SG-HMC positions, one of which is drawn for each Adam step.
         batch_size: transitions in a minibatch; all of them where there are fewer.
@@ -41,10 +42,10 @@ class InferenceSettings:
 
     step_size: float = 0.02
     decay: float = 0.05
-    hyperparameters: Hyperparameters = "sampled"
+    hyperparameters: Hyperparameters = "optimised"
     hyperparameter_step_size: float = 0.02
-    learning_rate: float = 0.03
-    hyperparameters_every: int = 4
+    learning_rate: float = 0.1
+    hyperparameters_every: int = 1
     window_size: int = 1
     batch_size: int = 256
     gibbs_every: int = 20

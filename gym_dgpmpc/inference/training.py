@@ -73,7 +73,7 @@ def train(
     generator: torch.Generator,
     settings: InferenceSettings,
     *,
-    burn_in: float = BURN_IN,
+    settled: bool = False,
     on_look: Callable[[int, float], None] | None = None,
 ) -> Trained:
     """Train for ``num_iterations`` iterations at most.
@@ -82,8 +82,7 @@ def train(
         model: hyperparameters to start from; left as they are.
         whitened: inducing outputs to start from, and their preconditioner.
         data: standardised; with early stopping a tenth of it serves to see when to stop.
-        burn_in: the share of the iterations in which preconditioners adapt, and hyperparameters that are to be sampled
-            are optimised.
+        settled: hyperparameters and preconditioners come from a training before, which makes for a shorter burn-in.
         on_look: is told the iterations done and the negative log likelihood, at the start and at every look.
 
     Raises:
@@ -93,7 +92,8 @@ def train(
     if settings.patience is not None:
         data, held_out, order = _split_off_held_out(data, generator)
     state = sampler.initial_state(model, whitened, data.num_rows, generator)
-    run = Chains(model, state, data, settings, round(burn_in * num_iterations))
+    burn_in = LATER_BURN_IN if settled else BURN_IN
+    run = Chains(model, state, data, settings, round(burn_in * num_iterations), settled=settled)
     good, best, rollbacks = run.snapshot(), run.evaluate(_copy_of(generator)), 0
     best_likelihood, looks_since = -math.inf, 0
     if on_look is not None:

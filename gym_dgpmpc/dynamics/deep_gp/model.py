@@ -29,33 +29,18 @@ from gym_dgpmpc.dynamics.deep_gp.draws import (
     Posterior,
     Refresh,
 )
+from gym_dgpmpc.dynamics.deep_gp.fitted import Fitted, FittedSizes, take_fitted
 from gym_dgpmpc.dynamics.deep_gp.start import initial_model, relocate, restandardise
 from gym_dgpmpc.dynamics.learner import Learner
-from gym_dgpmpc.dynamics.noise import NoiseSplit, observed, take_noise_split
+from gym_dgpmpc.dynamics.noise import observed
 from gym_dgpmpc.dynamics.predictive import Mixture
-from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.errors import FactorisationError
-from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all, posterior_mean, propagate
+from gym_dgpmpc.gp.deep_gp import Factorised, factorise_all, posterior_mean, propagate
 from gym_dgpmpc.gp.kernels import Kernel, find_kernel
-from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.inference import sghmc, training
-from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
 from gym_dgpmpc.inference.following import Follower
 from gym_dgpmpc.inference.settings import InferenceSettings
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
-
-
-class _Fitted(NamedTuple):
-    """What a fit leaves behind, and a `resample` moves on."""
-
-    factorised: Factorised  # of C chains; a saved state holds only its model
-    normalisers: tuple[Normaliser, Normaliser]
-    chain: sghmc.SGHMCState  # "C V"
-    latents: list[Tensor]  # "C N D" of each inner layer, float32
-    pool: Tensor  # "n C V", a ring of n samples of each chain
-    oldest: int  # the row of the pool that the next sample replaces
-    step_size: float  # of SG-HMC: the setting, unless training had to take smaller steps
-    noise: NoiseSplit | None = None  # None: not told apart
 
 
 class _Standardised(NamedTuple):
@@ -76,7 +61,7 @@ class _Standardised(NamedTuple):
         return Data(self.normalisers[0](x), self.normalisers[1](y))
 
 
-class DeepGPDynamics(Learner[_Fitted]):
+class DeepGPDynamics(Learner[Fitted]):
     """Implements `DynamicsModel` with a deep Gaussian process of L layers.
 
     Args:
@@ -135,18 +120,18 @@ class DeepGPDynamics(Learner[_Fitted]):
         *,
         num_layers: int = 2,
         kernel: str = "matern32",
-        num_inducing: int = 200,
+        num_inducing: int = 100,
         draw: Draw = "pathwise",
-        refresh: Refresh = "step",
-        num_features: int = 128,
-        first_training_iterations: int = 4000,
-        training_iterations: int = 1000,
+        refresh: Refresh = "plan",
+        num_features: int = 64,
+        first_training_iterations: int = 1000,
+        training_iterations: int = 300,
         num_chains: int = 5,
         num_samples: int = 100,
-        sample_spacing: int = 10,
+        sample_spacing: int = 5,
         resample_samples: int = 5,
         relocate: bool = True,
-        add_noise: bool = False,
+        add_noise: bool = True,
         split_noise: bool = True,
         compile: bool = True,
         dtype: torch.dtype = torch.float32,
@@ -198,13 +183,13 @@ class DeepGPDynamics(Learner[_Fitted]):
         """
         normalisers, standardised = self._standardised(data)
         if self._fitted is None:
-            iterations, burn_in = self.first_training_iterations, training.BURN_IN
+            iterations, settled = self.first_training_iterations, False
             model = initial_model(
                 self.kernel, standardised, self.num_layers, self.num_inducing, self.num_chains, generator
             )
             whitened = sghmc.init(standardised.x.new_zeros(self.num_chains, model.num_whitened()))
         else:
-            iterations, burn_in, last = self.training_iterations, training.LATER_BURN_IN, self._fitted
+            iterations, settled, last = self.training_iterations, True, self._fitted
             model, position = restandardise(last.factorised.model, last.chain.position, last.normalisers, normalisers)
             if self.relocate:
                 model, position = relocate(model, position, standardised, generator)
@@ -218,7 +203,7 @@ class DeepGPDynamics(Learner[_Fitted]):
             iterations,
             generator,
             self.inference,
-            burn_in=burn_in,
+            settled=settled,
             on_look=lambda done, loss: report(done, total, loss),
         )
         sampled = training.sample_pool(
@@ -235,12 +220,11 @@ class DeepGPDynamics(Learner[_Fitted]):
         variance = factorised.model.noise_variance.mean(0)
         noise = self._split_noise(data, normalisers, posterior_mean(factorised, sampled.pool), variance)
         latents = [latent.float() for latent in sampled.state.latents]
-        chain, step_size = sampled.state.whitened, sampled.step_size
         self._follower = None
-        self._fitted = _Fitted(factorised, normalisers, chain, latents, sampled.pool, 0, step_size, noise)
+        self._fitted = Fitted(factorised, normalisers, sampled.state.whitened, latents, sampled.pool, 0, noise)
         counts = {"iterations": float(trained.num_iterations), "rollbacks": float(trained.num_rollbacks)}
         metrics = {"negative_log_likelihood": trained.negative_log_likelihood} | counts
-        return metrics | self._diagnostics(self._fitted) | self._noise_metrics(noise, normalisers[1], variance)
+        return metrics | self._fitted.diagnostics() | self._noise_metrics(noise, normalisers[1], variance)
 
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """Follow the grown data: in every chain exact draws of the last layer replace the oldest samples.
@@ -331,17 +315,7 @@ class DeepGPDynamics(Learner[_Fitted]):
         """Hyperparameters, normalisers, the chain and the whole pool of samples; empty before the first fit."""
         if self._fitted is None:
             return {}
-        fitted, model = self._fitted, self._fitted.factorised.model
-        # The pool is the one tensor that changes in place, which must not change a state taken before.
-        state: StateDict = {"pool": fitted.pool.clone(), "oldest": fitted.oldest}
-        state["log_noise"] = model.log_noise
-        if fitted.step_size != self.inference.step_size:  # older states do not have this entry
-            state["step_size"] = fitted.step_size
-        for index, layer in enumerate(model.layers):
-            state |= {f"layers.{index}.{name}": value for name, value in layer.parameters().items()}
-        state |= {f"latents.{index}": latent for index, latent in enumerate(fitted.latents)}
-        state |= normalisers_state(*fitted.normalisers) | ({} if fitted.noise is None else fitted.noise.state())
-        return state | {f"chain.{name}": value for name, value in fitted.chain._asdict().items()}
+        return self._fitted.state_dict()
 
     def load_state_dict(self, state: StateDict) -> None:
         """Restore `state_dict` of a model with the same settings.
@@ -352,59 +326,15 @@ class DeepGPDynamics(Learner[_Fitted]):
         if not state:
             self._fitted = self._follower = None
             return
-        size, num_targets, device = self.encoder.input_size, self.encoder.target_size, self.device
-        whitened = self.num_inducing * (size * (self.num_layers - 1) + num_targets)
-
-        chains, count = self.num_chains, self._samples_of_chain
-
-        def take(name: str, *shape: int) -> Tensor:
-            return take_tensor(state, name, shape, device)
-
-        shapes = parameter_shapes(self.num_inducing, size)
-        shapes = {name: (chains, *shape) for name, shape in shapes.items()}
-        layers = (
-            Layer(self.kernel, **take_tensors(state, shapes, device, prefix=f"layers.{i}."))
-            for i in range(self.num_layers)
+        expected = FittedSizes(
+            num_chains=self.num_chains,
+            num_layers=self.num_layers,
+            num_inducing=self.num_inducing,
+            num_samples=self._samples_of_chain,
+            num_inputs=self.encoder.input_size,
+            num_targets=self.encoder.target_size,
         )
-        model = DeepGP(tuple(layers), take("log_noise", chains, num_targets))
-        normalisers = (
-            take_normaliser(state, "inputs", size, device),
-            take_normaliser(state, "targets", num_targets, device),
-        )
-        chain = sghmc.SGHMCState(*(take(f"chain.{name}", chains, whitened) for name in sghmc.SGHMCState._fields))
-        pool = take("pool", count, chains, whitened)
-        oldest = state.get("oldest")
-        if not isinstance(oldest, int) or not 0 <= oldest < count:
-            raise ValueError(f"dynamics state 'oldest': expected one of 0 to {count - 1}, received {oldest!r}")
-        latents = [self._take_latent(state, f"latents.{i}") for i in range(self.num_layers - 1)]
-        step_size = state.get("step_size", self.inference.step_size)
-        if not isinstance(step_size, float) or not 0.0 < step_size < math.inf:
-            raise ValueError(f"dynamics state 'step_size': expected a positive number, received {step_size!r}")
-        noise = take_noise_split(state, num_targets, device)
-        self._follower = None
-        self._fitted = _Fitted(factorise_all(model), normalisers, chain, latents, pool, oldest, step_size, noise)
-
-    def _take_latent(self, state: StateDict, name: str) -> Float[Tensor, "C N D"]:
-        """The latents of an inner layer, for however many rows there were."""
-        value = state.get(name)
-        rows = value.shape[1] if isinstance(value, Tensor) and value.ndim == 3 else 0
-        return take_tensor(state, name, (self.num_chains, rows, self.encoder.input_size), self.device, torch.float32)
-
-    def _diagnostics(self, fitted: _Fitted) -> dict[str, float]:
-        """Mixing of the kept samples (medians over coordinates), and the fitted noise and kernel scales."""
-        model = fitted.factorised.model
-        by_chain = fitted.pool.unbind(1)
-        sizes = torch.stack([effective_sample_size(samples) for samples in by_chain])
-        metrics = {
-            "effective_sample_size": float(sizes.sum(0).median()),
-            "gradient_norm": float(fitted.chain.gradient.norm(dim=-1).mean()),
-            "noise_std": float(model.noise_variance.sqrt().mean()),
-        }
-        if self._samples_of_chain >= 4:
-            metrics["r_hat"] = float(torch.stack([split_r_hat(samples) for samples in by_chain]).median())
-        for index, layer in enumerate(model.layers):
-            metrics[f"layer_{index + 1}_kernel_std"] = float(layer.variance.sqrt().mean())
-        return metrics
+        self._fitted, self._follower = take_fitted(state, self.kernel, expected, self.device), None
 
 
 def _report_nothing(done: int, total: int, loss: float) -> None:
