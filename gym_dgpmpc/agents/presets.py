@@ -33,7 +33,8 @@ PAPER = MappingProxyType(
         "RiskSensitiveHalfCheetah-v0": _HALF_CHEETAH,
     }
 )
-"""The planning settings of Gadd et al. (2020); layers and kernel are what the paper compares, so they are not here."""
+"""The planning settings of Gadd et al. (2020); layers and kernel are what the paper compares, so they are not here. Nor
+is its number of inducing points, 200: half as many learn as well here, in less than half of the time."""
 
 
 def _stock(**settings: Any) -> MappingProxyType[str, Any]:
@@ -126,5 +127,7 @@ COMPARISON_PETS = MappingProxyType(
 )
 """`PETSAgent` as in the comparison of Gadd et al.: PETS's networks, their planning, and one particle per network."""
 
-COMPARISON_GP = PAPER
+COMPARISON_GP = MappingProxyType(
+    {env_id: MappingProxyType({**settings, "num_inducing": 200}) for env_id, settings in PAPER.items()}
+)
 """`GPMPCAgent` as in the comparison of Gadd et al.: their planning and number of inducing points."""

@@ -16,7 +16,15 @@ MOST_MISSING = 10
 SPACES = ("observation_space", "action_space")
 ONE_CHAIN = {"num_chains": 1, "hyperparameters": "optimised"}
 """Arguments that make a deep Gaussian process what it was up to schema 5."""
-OLD_DEFAULTS = {"window_size": 100, "hyperparameters_every": 1, "learning_rate": 0.01}
+OLD_DEFAULTS = {
+    "window_size": 100,
+    "hyperparameters_every": 1,
+    "learning_rate": 0.01,
+    "num_inducing": 200,
+    "num_features": 128,
+    "refresh": "step",
+    "add_noise": False,
+}
 """Defaults of that time, of arguments that a file may lack."""
 
 Config = dict[str, Any]
