@@ -146,7 +146,7 @@ def test_a_file_of_other_settings_does_not_load_silently(tmp_path):
 def test_presets_are_arguments_and_the_papers(name):
     settings = presets.PAPER[name]
     assert set(settings) <= set(inspect.signature(DGPMPCAgent).parameters)
-    assert (settings["num_candidates"], settings["num_particles"], settings["num_inducing"]) == (300, 5, 200)
+    assert (settings["num_candidates"], settings["num_particles"]) == (300, 5)
     assert settings["num_elites"] == 30
     assert DGPMPCAgent(KnownPointMass(), **settings).planner.num_elites == 30
 

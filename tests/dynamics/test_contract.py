@@ -29,7 +29,7 @@ HORIZON, CANDIDATES, PARTICLES = 4, 3, 10  # a multiple of the networks, more th
 DEEP = {
     "kernel": "rbf", "num_inducing": 24, "num_features": 512, "first_training_iterations": 600,
     "training_iterations": 2,
-    "num_samples": 20, "sample_spacing": 2, "resample_samples": 2,
+    "num_samples": 20, "sample_spacing": 2, "resample_samples": 2, "add_noise": False,
 }  # fmt: skip
 NETWORKS = {"num_members": 5, "num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4)}
 

@@ -49,13 +49,14 @@ def test_it_predicts_unseen_transitions(trained):
     ids=["step", "plan", "joint", "marginal"],
 )
 def test_rollouts_in_single_precision_are_those_in_double(trained, draw):
-    """Same generator, same functions: one step within 1e-3 of the state's scale, and nine in ten states of rollouts.
+    """Same generator, same functions: one step within 1e-3 of the state's scale, and nine in ten states of rollouts;
+    with the RBF kernel, whose covariances of a hundred inducing points are the worst to invert, within 3e-3.
 
     Functions drawn with Matern-1/2 have no slope that bounds how a difference grows: their rollouts in double
     precision part from each other, too, when every step adds noise of the size of a step's rounding.
     """
     actions = 2 * torch.rand(CANDIDATES, HORIZON, 1, generator=seeded(1), dtype=torch.float32) - 1
-    scale = DATA.observation.std(0)
+    scale, bound = DATA.observation.std(0), 3e-3 if trained.kernel.name == "rbf" else 1e-3
 
     def sampler(dtype):
         return twin(trained, dtype, **draw).draw(PARTICLES, HORIZON, seeded(2))
@@ -70,12 +71,11 @@ def test_rollouts_in_single_precision_are_those_in_double(trained, draw):
     for step in range(HORIZON):  # one step at a time, from the same states
         state, action = single[step], actions[:, step]
         error = rounded(state, action, step) - exact(state.double(), action.double(), step)
-        assert (error.abs() / scale).max() < 1e-3
+        assert (error.abs() / scale).max() < bound
 
     def difference(other):
         return ((other - double).abs() / scale).flatten().quantile(0.9)
 
-    bound = 1e-3
     if trained.kernel.name == "matern12" and draw["draw"] == "pathwise":
         exact, generator = sampler(torch.float64), seeded(3)
 

@@ -23,11 +23,17 @@ def problem(num_data=120, noise=0.2):
     return Data(x, clean + noise * normal(generator, num_data, 2)), seeded(4)
 
 
+def start_from(data, num_inducing, generator, kernel="rbf"):
+    """Where a chain of one layer begins, without the chains' axis, which L-BFGS does not have."""
+    model = initial_model(KERNELS[kernel], data, 1, num_inducing, 1, generator)
+    return model.with_parameters([parameter[0] for parameter in model.parameters()])
+
+
 def test_it_climbs_to_a_stationary_point_and_finds_the_noise():
     """The maximum-likelihood variance of Gaussian noise has the standard error s sqrt(2 / N); degrees of freedom of
     the fit, some 15 of 120 for the first output, lower it further."""
     data, generator = problem()
-    start = initial_model(KERNELS["rbf"], data, 1, 15, generator)
+    start = start_from(data, 15, generator)
     found = maximise_bound(start, data, 300)
     before = collapsed_bound(start.layers[0], start.noise_variance, *data) / data.y.numel()
     assert found.bound > float(before)
@@ -46,7 +52,7 @@ def test_it_climbs_to_a_stationary_point_and_finds_the_noise():
 
 def test_frozen_inducing_inputs_stay():
     data, generator = problem()
-    start = initial_model(KERNELS["matern32"], data, 1, 15, generator)
+    start = start_from(data, 15, generator, "matern32")
     found = maximise_bound(start, data, 20, free_inducing_inputs=False)
     assert torch.equal(found.model.layers[0].inducing_inputs, start.layers[0].inducing_inputs)
     free = maximise_bound(start, data, 20)
@@ -56,14 +62,14 @@ def test_frozen_inducing_inputs_stay():
 def test_hyperparameters_stay_within_bounds():
     """Data without noise would take the noise to zero."""
     data, generator = problem(num_data=40, noise=0.0)
-    found = maximise_bound(initial_model(KERNELS["rbf"], data, 1, 40, generator), data, 200)
+    found = maximise_bound(start_from(data, 40, generator), data, 200)
     assert bool((found.model.log_noise >= math.log(NOISE_VARIANCES[0]) - 1e-9).all())
     assert bool((found.model.layers[0].lengthscale <= LENGTHSCALES[1] * (1 + 1e-9)).all())
 
 
 def test_it_starts_within_bounds_and_says_how_often_it_looked():
     data, generator = problem(num_data=30)
-    start = initial_model(KERNELS["rbf"], data, 1, 10, generator)
+    start = start_from(data, 10, generator)
     start = start._replace(log_noise=torch.full_like(start.log_noise, -100.0))
     found = maximise_bound(start, data, 1)
     assert math.isfinite(found.bound) and found.num_evaluations >= 1
@@ -80,7 +86,7 @@ def test_a_start_beyond_the_limits_is_moved_to_them(monkeypatch, variance, kept)
 
     monkeypatch.setattr("gym_dgpmpc.inference.lbfgs.minimize", stay)
     data, generator = problem(num_data=30)
-    start = initial_model(KERNELS["rbf"], data, 1, 10, generator)
+    start = start_from(data, 10, generator)
     layer = start.layers[0]._replace(
         log_lengthscale=torch.tensor([1e-30, 1e30]).double().log(), log_variance=torch.tensor(variance).double().log()
     )

@@ -20,11 +20,11 @@ def test_the_gradient_is_that_of_normal_densities(num_layers):
         return torch.distributions.Normal(values.new_tensor(centre), values.new_tensor(width)).log_prob(values).sum()
 
     for index, layer in enumerate(live.layers):
-        log_density = log_density + normal(layer.inducing_inputs, 0.0, 1.0)
+        log_density = log_density + normal(layer.inducing_inputs, 0.0, 10.0)
         variance = 1.0 if index == num_layers - 1 else 0.01
         for parameter, centre in ((layer.log_lengthscale, math.sqrt(3.0)), (layer.log_variance, variance)):
-            log_density = log_density + normal(parameter, math.log(centre), 1.5)
-    log_density = log_density + normal(live.log_noise, math.log(0.05), 1.5)
+            log_density = log_density + normal(parameter, math.log(centre), 3.0)
+    log_density = log_density + normal(live.log_noise, math.log(0.05), 3.0)
     found = priors.log_prior_gradient(model)
     for one, other in zip(found, torch.autograd.grad(log_density, leaves), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)

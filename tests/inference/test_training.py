@@ -39,6 +39,17 @@ def chains_of(data, settings, num_burn_in=0, **kind):
     return Chains(model, state, data, settings, num_burn_in)
 
 
+def ill_preconditioned(square):
+    """Where training begins with a mass far too small for the curvature, in a preconditioner that no longer adapts.
+
+    No step is safe then but a small one: how long a step may be is told from that mass.
+    """
+    model, whitened = started(waves(60, 0), kernel="matern32")
+    return model, whitened._replace(
+        square=torch.full_like(whitened.square, square), averaging=torch.full_like(whitened.averaging, 1e12)
+    )
+
+
 def mixture_log_likelihood(model, pool, data):
     """Of the mixture over samples as well as chains."""
     factorised = factorise_all(model)
@@ -179,23 +190,23 @@ def test_adam_takes_the_smaller_steps_after_a_rollback():
 
 
 @pytest.mark.usefixtures("unchecked")  # hundreds of steps
-@pytest.mark.parametrize("step_size", [5.0, 10.0])
+@pytest.mark.parametrize("step_size", [0.25, 0.5])
 def test_a_run_that_diverges_goes_back_and_takes_smaller_steps(step_size):
-    """Steps of 10 without exact draws explode at once; what comes out is a usable model all the same.
+    """With such a mass they explode at once; what comes out is a usable model all the same.
 
-    How far such a chain has got after 200 steps is chance, and another processor's rounding throws the dice anew; only
+    How far such a chain has got after 60 steps is chance, and another processor's rounding throws the dice anew; only
     what the criterion of divergence leaves is certain.
     """
     data = waves(60, 0)
     settings = InferenceSettings(step_size=step_size, look_every=20, gibbs_every=0)
     start = chains_of(data, settings, kernel="matern32").evaluate(seeded())
-    trained = train(*started(data, kernel="matern32"), data, 200, seeded(), settings)
+    trained = train(*ill_preconditioned(1e-4), data, 60, seeded(), settings)
     assert 1 <= trained.num_rollbacks <= training.MAX_ROLLBACKS
     assert trained.settings.step_size == step_size / 2**trained.num_rollbacks
     assert trained.settings.learning_rate == settings.learning_rate / 2**trained.num_rollbacks
     smaller = settings.hyperparameter_step_size / 2**trained.num_rollbacks
     assert trained.settings.hyperparameter_step_size == smaller
-    assert trained.num_iterations == 200
+    assert trained.num_iterations == 60
     assert trained.negative_log_likelihood < start + training.EXPLODED
     assert all(p.isfinite().all() for p in trained.model.parameters())
     assert training.is_plausible(trained.state.whitened.position)
@@ -205,7 +216,7 @@ def test_a_run_that_diverges_goes_back_and_takes_smaller_steps(step_size):
 def test_a_run_that_cannot_be_saved_says_so():
     data = waves(60, 0)
     with pytest.raises(TrainingError, match=r"\b6 times.*\b31\.25\b.*\b60 transitions"):
-        train(*started(data, kernel="matern32"), data, 100, seeded(), InferenceSettings(step_size=1e3, gibbs_every=0))
+        train(*ill_preconditioned(1e-8), data, 100, seeded(), InferenceSettings(step_size=1e3, gibbs_every=0))
 
 
 def test_a_covariance_that_cannot_be_factorised_is_gone_back_from(monkeypatch):
@@ -305,10 +316,10 @@ def test_held_out_rows_are_not_trained_on():
 def test_sampling_that_diverges_begins_anew_with_smaller_steps(num_layers, gibbs_every):
     data = waves(40, 0)
     model, whitened = started(data, num_layers)
-    # A preconditioner far too large for the curvature: unstable until the step has been halved a few times. Of one
-    # chain: it takes the others along.
+    # A mass far too small for the curvature: unstable until the step has been halved a few times. Of one chain: it
+    # takes the others along.
     square = whitened.square.clone()
-    square[1] = 1e-2
+    square[1] = 1e-4
     state = sampler.initial_state(model, whitened._replace(square=square), 40, seeded(1))
     latents = [latent.clone() for latent in state.latents]
     settings = InferenceSettings(gibbs_every=gibbs_every, step_size=1.0)
