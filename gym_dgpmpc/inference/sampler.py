@@ -11,8 +11,8 @@ Given v and theta the data are independent, so each e_n is moved by a Metropolis
 layer is drawn exactly (`last_layer.py`), given all else. `training.py` decides how long; `dynamics/deep_gp/` keeps what
 comes out.
 
-With ``hyperparameters="optimised"`` theta follows the moving-window Monte Carlo EM of the paper instead: Adam steps
-under positions of the latest SG-HMC steps.
+With ``hyperparameters="optimised"``, the default, theta follows the moving-window Monte Carlo EM of the paper instead:
+Adam steps under positions of the latest SG-HMC steps.
 """
 
 import copy
@@ -109,7 +109,7 @@ class Chains:
         settled: bool = False,
     ):
         self._kernels, self.data, self.settings, self._num_burn_in = model, data, settings, num_burn_in
-        self._settled = settled
+        self._settled, self._asked = settled, settings.step_size
         self.state = state
         self._flat = state.parameters.position.clone()
         self._optimiser = torch.optim.Adam([self._flat], lr=settings.learning_rate)
@@ -184,7 +184,9 @@ class Chains:
         self.state = self.state._replace(whitened=whitened._replace(position=position, momentum=momentum))
 
     def _step_sizes(self, state: SGHMCState, step_size: float, batch_size: int) -> Float[Tensor, "C V"]:
-        return step_sizes(state, step_size, self.settings.decay, batch_size, self.data.num_rows)
+        # After a rollback the bounds shrink as the settings do, or it might change nothing.
+        share = self.settings.step_size / self._asked
+        return share * step_sizes(state, step_size / share, self.settings.decay, batch_size, self.data.num_rows)
 
     def last_layer_draws(self, num_samples: int, generator: torch.Generator) -> Float[Tensor, "n C V"]:
         """Positions that share the chains' inner layers, each with its own exact draw of the last layer."""

@@ -145,9 +145,11 @@ def sample_pool(
     Raises:
         TrainingError: it did so again and again, with ever smaller steps.
     """
+    asked = settings
     for _ in range(MAX_ROLLBACKS + 1):
         start = state._replace(latents=[latent.clone() for latent in state.latents])
-        chains, positions = Chains(model, start, data, settings, 0), []
+        chains, positions = Chains(model, start, data, asked, 0), []
+        chains.settings = settings
         with suppress(FactorisationError):  # in an exact draw: the steps before it left values that are not finite
             for position in sampler.sample(chains, num_samples, spacing, generator):
                 positions.append(position)
