@@ -237,7 +237,7 @@ def test_one_loaded_within_an_episode_goes_on_bit_by_bit(loaded_at, num_layers):
     for num_rows in range(31, loaded_at + 1):
         model.resample(pendulum.simulate(num_rows), generator)
     state = {name: torch.as_tensor(value).clone() for name, value in model.state_dict().items()}
-    other.load_state_dict(state | {name: int(state[name]) for name in ("oldest", "num_rows")})
+    other.load_state_dict(state | {"oldest": int(state["oldest"])})
     again = torch.Generator()
     again.set_state(generator.get_state())
     for num_rows in range(loaded_at + 1, loaded_at + 4):
@@ -331,23 +331,6 @@ def test_a_state_without_latents_of_its_rows_has_them_drawn():
     assert torch.equal(predictions(model), predictions(fitted()))
     model.resample(pendulum.simulate(31), seeded())
     assert model.state_dict()["latents.0"].shape == (2, 31, 4)
-
-
-@pytest.mark.parametrize(("num_rows", "iterations"), [(60, 20), (40, 10), (31, 5), (30, 5)])
-def test_a_later_fit_trains_as_long_as_the_share_of_new_transitions_asks_for(num_rows, iterations):
-    model = tiny(first_training_iterations=40, training_iterations=5)
-    assert model.fit(pendulum.simulate(30), seeded())["iterations"] == 40
-    state = model.state_dict()
-    assert model.fit(pendulum.simulate(num_rows), seeded())["iterations"] == iterations
-    other = tiny(first_training_iterations=40, training_iterations=5)
-    other.load_state_dict(state)
-    assert other.fit(pendulum.simulate(num_rows), seeded())["iterations"] == iterations
-
-
-@pytest.mark.parametrize("num_rows", [-1, 10**12, 3.0, None])
-def test_a_number_of_rows_that_cannot_be_is_refused(num_rows):
-    with pytest.raises(ValueError, match=rf"'num_rows'.* {num_rows}$"):
-        tiny().load_state_dict(fitted().state_dict() | {"num_rows": num_rows})
 
 
 @pytest.mark.parametrize("oldest", [-1, 4])
