@@ -126,7 +126,7 @@ class DeepGPDynamics(Learner[Fitted]):
         refresh: Refresh = "plan",
         num_features: int = 64,
         first_training_iterations: int = 1000,
-        training_iterations: int = 300,
+        training_iterations: int = 150,
         num_chains: int = 5,
         num_samples: int = 100,
         sample_spacing: int = 5,
