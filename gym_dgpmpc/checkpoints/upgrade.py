@@ -62,10 +62,7 @@ def _with_chains(config: Config, tensors: Tensors) -> tuple[Config, Tensors]:
     for index in range(len(layers) - 1):
         shape = 1, 0, held["layers.0.inducing_inputs"].shape[1]
         upgraded[f"latents.{index}"] = torch.zeros(shape, dtype=torch.float32, device="cpu")
-    # How many transitions were trained on was not kept: as if all were new, the next training is as long as the first.
-    values = config["values"]
-    values = values | {"dynamics": values["dynamics"] | {"num_rows": 0}}
-    return config | {"values": values}, tensors | {"dynamics": upgraded}
+    return config, tensors | {"dynamics": upgraded}
 
 
 def _by_noun(config: Config, tensors: Tensors, schema: int) -> tuple[Config, Tensors]:

@@ -19,9 +19,6 @@ from gym_dgpmpc.inference import sghmc
 from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
 from gym_dgpmpc.types import StateDict
 
-MOST_ROWS = 10**12
-"""Transitions that a state may say it was trained on."""
-
 
 class Fitted(NamedTuple):
     """C chains: their hyperparameters, where they are, and samples that they left."""
@@ -32,15 +29,13 @@ class Fitted(NamedTuple):
     latents: list[Tensor]  # "C N D" of each inner layer, float32
     pool: Tensor  # "n C V", a ring of n samples of each chain
     oldest: int  # the row of the pool that the next sample replaces
-    num_rows: int  # transitions that were trained on
     noise: NoiseSplit | None = None  # None: not told apart
 
     def state_dict(self) -> StateDict:
         """As entries of a state; see `take_fitted`."""
         model = self.factorised.model
         # The pool is the one tensor that changes in place, which must not change a state taken before.
-        state: StateDict = {"pool": self.pool.clone(), "oldest": self.oldest, "num_rows": self.num_rows}
-        state["log_noise"] = model.log_noise
+        state: StateDict = {"pool": self.pool.clone(), "oldest": self.oldest, "log_noise": model.log_noise}
         for index, layer in enumerate(model.layers):
             state |= {f"layers.{index}.{name}": value for name, value in layer.parameters().items()}
         state |= {f"latents.{index}": latent for index, latent in enumerate(self.latents)}
@@ -97,11 +92,12 @@ def take_fitted(state: StateDict, kernel: Kernel, sizes: FittedSizes, device: to
         take_normaliser(state, "targets", num_targets, device),
     )
     chain = sghmc.SGHMCState(*(take(f"chain.{name}", chains, whitened) for name in sghmc.SGHMCState._fields))
-    pool, oldest = take("pool", sizes.num_samples, chains, whitened), _take_count(state, "oldest", sizes.num_samples)
-    num_rows = _take_count(state, "num_rows", MOST_ROWS)
+    pool, oldest = take("pool", sizes.num_samples, chains, whitened), state.get("oldest")
+    if not isinstance(oldest, int) or not 0 <= oldest < sizes.num_samples:
+        raise ValueError(f"dynamics state 'oldest': expected one of 0 to {sizes.num_samples - 1}, received {oldest!r}")
     latents = [_take_latent(state, f"latents.{index}", chains, size, device) for index in range(sizes.num_layers - 1)]
     noise = take_noise_split(state, num_targets, device)
-    return Fitted(factorise_all(model), normalisers, chain, latents, pool, oldest, num_rows, noise)
+    return Fitted(factorise_all(model), normalisers, chain, latents, pool, oldest, noise)
 
 
 def _take_latent(
@@ -111,10 +107,3 @@ def _take_latent(
     value = state.get(name)
     rows = value.shape[1] if isinstance(value, Tensor) and value.ndim == 3 else 0
     return take_tensor(state, name, (num_chains, rows, size), device, torch.float32)
-
-
-def _take_count(state: StateDict, name: str, below: int) -> int:
-    value = state.get(name)
-    if not isinstance(value, int) or not 0 <= value < below:
-        raise ValueError(f"dynamics state {name!r}: expected one of 0 to {below - 1}, received {value!r}")
-    return value

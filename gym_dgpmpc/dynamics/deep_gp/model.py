@@ -79,8 +79,7 @@ class DeepGPDynamics(Learner[Fitted]):
             as F^-1/2.
         first_training_iterations: training iterations of the first fit, of one SG-HMC step each; every few of them move
             the hyperparameters.
-        training_iterations: the fewest of a later fit, which goes on from the fit before: it has as large a part of
-            ``first_training_iterations`` as new transitions are of all.
+        training_iterations: training iterations of each later fit, which goes on from the fit before.
         num_chains: chains of the sampler, C, with hyperparameters and inducing inputs of their own; particles are
             spread over them.
         num_samples: posterior samples kept (the pool), over all chains, rounded up to as many of each; the worlds of a
@@ -126,7 +125,7 @@ class DeepGPDynamics(Learner[Fitted]):
         refresh: Refresh = "plan",
         num_features: int = 64,
         first_training_iterations: int = 1000,
-        training_iterations: int = 150,
+        training_iterations: int = 300,
         num_chains: int = 5,
         num_samples: int = 100,
         sample_spacing: int = 5,
@@ -183,7 +182,6 @@ class DeepGPDynamics(Learner[Fitted]):
             TrainingError: training diverged with ever smaller steps; the model is as it was.
         """
         normalisers, standardised = self._standardised(data)
-        num_rows = standardised.num_rows
         if self._fitted is None:
             iterations, settled = self.first_training_iterations, False
             model = initial_model(
@@ -191,9 +189,7 @@ class DeepGPDynamics(Learner[Fitted]):
             )
             whitened = sghmc.init(standardised.x.new_zeros(self.num_chains, model.num_whitened()))
         else:
-            settled, last = True, self._fitted
-            new = max(num_rows - last.num_rows, 0) / num_rows
-            iterations = max(self.training_iterations, round(new * self.first_training_iterations))
+            iterations, settled, last = self.training_iterations, True, self._fitted
             model, position = restandardise(last.factorised.model, last.chain.position, last.normalisers, normalisers)
             if self.relocate:
                 model, position = relocate(model, position, standardised, generator)
@@ -225,9 +221,7 @@ class DeepGPDynamics(Learner[Fitted]):
         noise = self._split_noise(data, normalisers, posterior_mean(factorised, sampled.pool), variance)
         latents = [latent.float() for latent in sampled.state.latents]
         self._follower = None
-        self._fitted = Fitted(
-            factorised, normalisers, sampled.state.whitened, latents, sampled.pool, 0, num_rows, noise
-        )
+        self._fitted = Fitted(factorised, normalisers, sampled.state.whitened, latents, sampled.pool, 0, noise)
         counts = {"iterations": float(trained.num_iterations), "rollbacks": float(trained.num_rollbacks)}
         metrics = {"negative_log_likelihood": trained.negative_log_likelihood} | counts
         return metrics | self._fitted.diagnostics() | self._noise_metrics(noise, normalisers[1], variance)
