@@ -45,9 +45,10 @@ def table(rows: list[dict[str, Any]]) -> str:
     cells = []
     for key, group in groups.items():
         means = {score: fmean(row[score] for row in group) for score in SCORES}
-        error = stdev([row["nll"] for row in group]) / len(group) ** 0.5 if len(group) > 1 else float("nan")
         shown = [f"{means[score]:.3f}" if score in ("crps", "rmse") else f"{means[score]:.2f}" for score in SCORES]
-        shown[SCORES.index("nll")] += f" ± {error:.2f}"
+        if len(group) > 1:
+            error = stdev([row["nll"] for row in group]) / len(group) ** 0.5
+            shown[SCORES.index("nll")] += f" ± {error:.2f}"
         cells.append([*map(str, key), str(len(group)), *shown])
     names = ["task", "episodes", "test", "steps", "model", "seeds", *SCORES]
     commands = ", ".join(f"`{each}`" for each in dict.fromkeys(row["command"] for row in rows))
@@ -75,7 +76,8 @@ def main() -> None:
                     continue
                 started = time.time()
                 found = measure(MODELS[name], task, seed, tuple(arguments.episodes), arguments.data)
-                rows += [{"model": name} | row | about for row in found]
+                # In place of what a command for fewer episodes left of this seed.
+                rows = [row for row in rows if row["seed"] != seed] + [{"model": name} | row | about for row in found]
                 replace_text(file, json.dumps({"rows": rows}, indent=1) + "\n")
                 print(f"{task}, seed {seed}, {name}: {time.time() - started:.0f} s", flush=True)
     shown = table(every_row(arguments.results))
