@@ -1,7 +1,7 @@
 """One sparse Gaussian-process layer with whitened inducing outputs.
 
-`deep_gp.py` composes layers; training differentiates through `conditional`, the draws of a trained model reuse
-`factorise`. All outputs of a layer share one ARD kernel, so one factorisation serves them all.
+`deep_gp.py` composes layers; the collapsed bound (`sgpr.py`) differentiates through `project`, the draws of a trained
+model reuse `factorise`. All outputs of a layer share one ARD kernel, so one factorisation serves them all.
 
 A layer may stand for C layers side by side, those of C chains: every tensor then has a leading axis "C", which the
 points have too, before their own.

@@ -22,9 +22,6 @@ BLOCK = 32
 """Rows whose terms are added together, once and for all as soon as there are so many. Sums over whole blocks, in their
 order, are the same numbers whether they were made one by one or all at once after loading."""
 
-MOVES = 1
-"""Metropolis steps of the latents of each row of the newest block, after each new row."""
-
 
 class Followed(NamedTuple):
     """Samples of the chains under the grown data."""
@@ -45,6 +42,9 @@ class Follower:
     def __init__(self, factorised: Factorised, inner: Float[Tensor, "C I"]):
         self._factorised, self._inner = factorised, inner
         self._terms = layer_terms(factorised)
+        # What the last layer is fed does not depend on where it is itself.
+        rest = inner.new_zeros(len(inner), factorised.model.num_whitened() - inner.shape[1])
+        self._whitened = factorised.model.split(torch.cat([inner, rest], dim=1))
         chains, targets = factorised.model.log_noise.shape
         size = factorised.model.layers[-1].inducing_inputs.shape[-2]
         self._sum = LastLayerEvidence(
@@ -94,13 +94,10 @@ class Follower:
         first: int,
         generator: torch.Generator,
     ) -> None:
-        """Move the latents of the rows from ``first`` on, in place."""
+        """One Metropolis step of the latents of the rows from ``first`` on, in place."""
         batch, whitened = _rows(data, first, data.num_rows, position), self._factorised.model.split(position)
-        moved = [latent[:, first:].to(position) for latent in latents]
-        passed = None
-        for _ in range(MOVES):
-            every, moved = move_latents(self._factorised, self._terms, whitened, batch, moved, generator, passed)
-            passed = every[0]
+        present = [latent[:, first:].to(position) for latent in latents]
+        _, moved = move_latents(self._factorised, self._terms, whitened, batch, present, generator)
         for latent, new in zip(latents, moved, strict=True):
             latent[:, first:] = new.float()
 
@@ -109,11 +106,8 @@ class Follower:
     ) -> LastLayerEvidence:
         """Of the rows from ``first`` to ``end``."""
         batch = _rows(data, first, end, self._inner)
-        # What the last layer is fed does not depend on where it is itself.
-        none = self._inner.new_zeros(len(self._inner), self._factorised.model.num_whitened() - self._inner.shape[1])
-        whitened = self._factorised.model.split(torch.cat([self._inner, none], dim=1))
         x = batch.x.expand(len(self._inner), -1, -1)
-        passed = forward(self._terms, whitened, x, [latent[:, first:end].to(x) for latent in latents])
+        passed = forward(self._terms, self._whitened, x, [latent[:, first:end].to(x) for latent in latents])
         return last_layer_evidence(self._factorised, self._terms[-1], passed[-1], batch.y)
 
 

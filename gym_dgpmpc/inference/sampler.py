@@ -1,4 +1,4 @@
-"""C chains side by side: SG-HMC over inducing outputs and hyperparameters, Metropolis moves of the latents.
+"""C chains side by side: SG-HMC over inducing outputs, Metropolis moves of the latents, steps of hyperparameters.
 
 The target is the joint posterior of everything that is not observed,
 
@@ -17,7 +17,6 @@ Adam steps under positions of the latest SG-HMC steps.
 
 import copy
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -96,6 +95,7 @@ class Chains:
             adapts. After them that stays, since one that follows the chain makes it wander too far, and "sampled"
             hyperparameters are moved by SG-HMC, "optimised" ones by Adam as before.
         settled: the hyperparameters come from a training before, so that Adam begins with its last learning rate.
+        scale: what all steps of ``settings``, and their bounds, are multiplied by; below one after a divergence.
     """
 
     def __init__(
@@ -107,9 +107,10 @@ class Chains:
         num_burn_in: int,
         *,
         settled: bool = False,
+        scale: float = 1.0,
     ):
         self._kernels, self.data, self.settings, self._num_burn_in = model, data, settings, num_burn_in
-        self._settled, self._asked = settled, settings.step_size
+        self._settled, self.scale = settled, scale
         self.state = state
         self._flat = state.parameters.position.clone()
         self._optimiser = torch.optim.Adam([self._flat], lr=settings.learning_rate)
@@ -184,9 +185,7 @@ class Chains:
         self.state = self.state._replace(whitened=whitened._replace(position=position, momentum=momentum))
 
     def _step_sizes(self, state: SGHMCState, step_size: float, batch_size: int) -> Float[Tensor, "C V"]:
-        # After a rollback the bounds shrink as the settings do, or it might change nothing.
-        share = self.settings.step_size / self._asked
-        return share * step_sizes(state, step_size / share, self.settings.decay, batch_size, self.data.num_rows)
+        return self.scale * step_sizes(state, step_size, self.settings.decay, batch_size, self.data.num_rows)
 
     def last_layer_draws(self, num_samples: int, generator: torch.Generator) -> Float[Tensor, "n C V"]:
         """Positions that share the chains' inner layers, each with its own exact draw of the last layer."""
@@ -275,9 +274,10 @@ class Chains:
                 burn_in=True,
             )
         else:
-            parameters = sghmc.adapt(parameters, gradient)
+            if sampled:  # which the preconditioner is for
+                parameters = sghmc.adapt(parameters, gradient)
             done = 1.0 if self._settled else min(self.iteration / max(self._num_burn_in, 1), 1.0)
-            self._optimiser.param_groups[0]["lr"] = settings.learning_rate * LAST_LEARNING_RATE**done
+            self._optimiser.param_groups[0]["lr"] = self.scale * settings.learning_rate * LAST_LEARNING_RATE**done
             self._flat.copy_(parameters.position)
             self._flat.grad = gradient
             self._optimiser.step()
@@ -294,7 +294,7 @@ class Chains:
         )
 
     def restore(self, snapshot: "Snapshot", scale: float = 1.0) -> None:
-        """Go back to a snapshot, with all step sizes multiplied by ``scale``, and the chains brought to rest.
+        """Go back to a snapshot, with all further steps multiplied by ``scale``, and the chains brought to rest.
 
         The snapshot may be used again.
         """
@@ -305,8 +305,7 @@ class Chains:
         self._optimiser.load_state_dict(copy.deepcopy(snapshot.optimiser))
         self._window.copy_(snapshot.window)
         self.iteration, self.value = snapshot.iteration, snapshot.value
-        names = ("step_size", "hyperparameter_step_size", "learning_rate")
-        self.settings = replace(self.settings, **{name: scale * getattr(self.settings, name) for name in names})
+        self.scale *= scale
         self._refactorise()
 
 

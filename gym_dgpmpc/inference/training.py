@@ -7,7 +7,6 @@ size. If the likelihood of held-out data no longer improves, it stops. `dynamics
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -51,8 +50,8 @@ class Trained(NamedTuple):
     """The last one, per observation, on a minibatch; the mean over the chains."""
     num_iterations: int
     num_rollbacks: int
-    settings: InferenceSettings
-    """Those asked for, with smaller step sizes if training needed them."""
+    scale: float
+    """What steps had to be multiplied by: one half for each rollback."""
 
 
 class Sampled(NamedTuple):
@@ -61,8 +60,8 @@ class Sampled(NamedTuple):
     pool: Float[Tensor, "n C V"]
     state: ChainState
     """At the last of the samples."""
-    step_size: float
-    """The one asked for, unless it had to be made smaller."""
+    scale: float
+    """What steps had to be multiplied by."""
 
 
 def train(
@@ -103,9 +102,10 @@ def train(
         if trouble is not None:
             rollbacks += 1
             if rollbacks > MAX_ROLLBACKS:
+                step_size = run.scale * settings.step_size
                 raise TrainingError(
                     f"training diverged {rollbacks} times, the last time after iteration {good.iteration} with the "
-                    f"step size {run.settings.step_size:g}: {trouble}. Check whether the values of the {data.num_rows} "
+                    f"step size {step_size:g}: {trouble}. Check whether the values of the {data.num_rows} "
                     "transitions are plausible, or train with a smaller step_size"
                 )
             run.restore(good, scale=0.5)
@@ -124,7 +124,7 @@ def train(
     value, state = float(run.value.mean()), run.state
     if order is not None:
         state = state._replace(latents=[_in_order(latent, order, num_rows, generator) for latent in state.latents])
-    return Trained(run.model, state, value, run.iteration, rollbacks, run.settings)
+    return Trained(run.model, state, value, run.iteration, rollbacks, run.scale)
 
 
 def sample_pool(
@@ -135,32 +135,34 @@ def sample_pool(
     spacing: int,
     generator: torch.Generator,
     settings: InferenceSettings,
+    scale: float = 1.0,
     on_sample: Callable[[int], None] | None = None,
 ) -> Sampled:
     """Posterior samples of each chain, ``spacing`` steps apart.
 
-    Begins anew with half the step size if a chain leaves what is plausible. After each sample ``on_sample`` is told
-    how many there are.
+    Begins anew with half the steps if a chain leaves what is plausible. After each sample ``on_sample`` is told how
+    many there are.
+
+    Args:
+        scale: what training had to multiply steps by.
 
     Raises:
         TrainingError: it did so again and again, with ever smaller steps.
     """
-    asked = settings
     for _ in range(MAX_ROLLBACKS + 1):
         start = state._replace(latents=[latent.clone() for latent in state.latents])
-        chains, positions = Chains(model, start, data, asked, 0), []
-        chains.settings = settings
+        chains, positions = Chains(model, start, data, settings, 0, scale=scale), []
         with suppress(FactorisationError):  # in an exact draw: the steps before it left values that are not finite
             for position in sampler.sample(chains, num_samples, spacing, generator):
                 positions.append(position)
                 if on_sample is not None:
                     on_sample(len(positions))
         if len(positions) == num_samples and is_plausible(pool := torch.stack(positions)):
-            return Sampled(pool, chains.state, settings.step_size)
-        settings = replace(settings, step_size=0.5 * settings.step_size)
+            return Sampled(pool, chains.state, scale)
+        scale *= 0.5
     raise TrainingError(
         f"sampling the posterior diverged {MAX_ROLLBACKS + 1} times, the last time with the step size "
-        f"{2 * settings.step_size:g}: train with a smaller step_size"
+        f"{2 * scale * settings.step_size:g}: train with a smaller step_size"
     )
 
 

@@ -77,8 +77,8 @@ class DeepGPDynamics(Learner[Fitted]):
         refresh: when a particle of a "pathwise" draw gets a new function: at each "step" of a plan, or once per "plan".
         num_features: random features of a "pathwise" draw, F, an even number; the error of its prior covariance falls
             as F^-1/2.
-        first_training_iterations: training iterations of the first fit, of one SG-HMC step each; every few of them move
-            the hyperparameters.
+        first_training_iterations: training iterations of the first fit, each with one SG-HMC step and, unless
+            ``hyperparameters_every`` says otherwise, one of the hyperparameters.
         training_iterations: training iterations of each later fit, which goes on from the fit before.
         num_chains: chains of the sampler, C, with hyperparameters and inducing inputs of their own; particles are
             spread over them.
@@ -88,7 +88,8 @@ class DeepGPDynamics(Learner[Fitted]):
         resample_samples: samples of each chain that are replaced after each control step, by exact draws of the last
             layer given the new data too; 0 keeps the posterior as it is within an episode.
         relocate: move the inducing inputs to the cluster centres of the grown data before each later fit.
-        add_noise: draw the fitted noise too, so that plans reckon with it: for plants or sensors that are noisy.
+        add_noise: draw the fitted noise too, so that plans reckon with it; without it, as in the paper, worlds are the
+            function alone.
         split_noise: where ``add_noise`` is on, tell the sensors' noise, which only blurs what is observed, from the
             process's, which adds up over a plan, as far as the data show it; otherwise all of it adds up.
         compile: roll "pathwise" draws out in compiled code, several times faster; a C++ compiler builds it once in a
@@ -213,7 +214,8 @@ class DeepGPDynamics(Learner[Fitted]):
             samples,
             spacing,
             generator,
-            trained.settings,
+            self.inference,
+            trained.scale,
             lambda count: report(iterations + count * spacing, total, trained.negative_log_likelihood),
         )
         factorised = factorise_all(trained.model)
