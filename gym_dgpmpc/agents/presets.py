@@ -34,7 +34,8 @@ PAPER = MappingProxyType(
     }
 )
 """The planning settings of Gadd et al. (2020); layers and kernel are what the paper compares, so they are not here. Nor
-is its number of inducing points, 200: half as many learn as well here, in less than half of the time."""
+is its number of inducing points, 200: half as many predict as well here (docs/calibration.md), in less than half of the
+time."""
 
 
 def _stock(**settings: Any) -> MappingProxyType[str, Any]:
@@ -96,7 +97,7 @@ _CART_POLE_NETWORKS = _networks((3, 500), (1e-4, 2.5e-4, 2.5e-4, 5e-4), 1e-3)
 _REACHER_NETWORKS = _networks((4, 200), (2.5e-4, 5e-4, 5e-4, 5e-4, 7.5e-4), 7.5e-4)
 _HALF_CHEETAH_NETWORKS = _networks((4, 200), (2.5e-5, 5e-5, 7.5e-5, 7.5e-5, 1e-4), 1e-3)
 
-_NETWORKS = {
+NETWORKS = {
     "ModCartPole-v0": _CART_POLE_NETWORKS,
     "SwingUpCartPole-v0": _CART_POLE_NETWORKS,
     "Reacher7DoF-v0": _REACHER_NETWORKS,
@@ -104,6 +105,7 @@ _NETWORKS = {
     "VelocityHalfCheetah-v0": _HALF_CHEETAH_NETWORKS,
     "RiskSensitiveHalfCheetah-v0": _HALF_CHEETAH_NETWORKS,
 }
+"""The networks of Chua et al. (2018) by task, and how they are trained, for `PETSAgent` and `EnsembleDynamics`."""
 
 
 def _published(env_id: str) -> MappingProxyType[str, Any]:
@@ -116,14 +118,14 @@ def _published(env_id: str) -> MappingProxyType[str, Any]:
         "actions_per_plan": 1,
         "num_particles": 20,
     }
-    return MappingProxyType({**_NETWORKS[env_id], **planning})
+    return MappingProxyType({**NETWORKS[env_id], **planning})
 
 
-PETS = MappingProxyType({env_id: _published(env_id) for env_id in _NETWORKS})
+PETS = MappingProxyType({env_id: _published(env_id) for env_id in NETWORKS})
 """The settings of Chua et al. (2018), for `PETSAgent`: networks, their training, and planning."""
 
 COMPARISON_PETS = MappingProxyType(
-    {env_id: MappingProxyType({**networks, **PAPER[env_id]}) for env_id, networks in _NETWORKS.items()}
+    {env_id: MappingProxyType({**networks, **PAPER[env_id]}) for env_id, networks in NETWORKS.items()}
 )
 """`PETSAgent` as in the comparison of Gadd et al.: PETS's networks, their planning, and one particle per network."""
 

@@ -1,5 +1,6 @@
 """The base of models that are fitted to encoded transitions: the encoding, and whether there was a fit yet."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Generic, TypeVar
 
@@ -21,7 +22,7 @@ ROWS_AT_ONCE = 1000
 """Transitions that `predictive` looks at together, so that memory stays small."""
 
 
-class Learner(Generic[Fitted]):
+class Learner(ABC, Generic[Fitted]):
     """Base of a `DynamicsModel` that keeps what a fit left in ``_fitted``.
 
     Transitions and states of rollouts may be float64: see `takes_float64`.
@@ -141,9 +142,9 @@ class Learner(Generic[Fitted]):
         ]
         return Predictive(*(torch.cat(parts) for parts in zip(*by_rows, strict=True)))
 
+    @abstractmethod
     def _mixture(self, x: Float[Tensor, "n D"], generator: torch.Generator) -> Mixture:
         """The predictive density of the targets, both in raw units, float64."""
-        raise NotImplementedError
 
     def _require_fit(self, verb: str) -> Fitted:
         if self._fitted is None:

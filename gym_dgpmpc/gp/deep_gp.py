@@ -73,13 +73,6 @@ class DeepGP(NamedTuple):
         """The models of these chains, the same one more than once if need be."""
         return self.with_parameters([tensor[chain] for tensor in self.parameters()])
 
-    def at_all(self, num_chains: int) -> "DeepGP":
-        """The same model for each of C chains."""
-        return self.with_parameters([tensor.expand(num_chains, *tensor.shape) for tensor in self.parameters()])
-
-    def detach(self) -> "DeepGP":
-        return self.with_parameters([tensor.detach() for tensor in self.parameters()])
-
 
 class Factorised(NamedTuple):
     """A model and L_z of its layers, computed once for all that is done with these hyperparameters.
@@ -89,10 +82,6 @@ class Factorised(NamedTuple):
 
     model: DeepGP
     factors: list[Float[Tensor, "*c M M"]]
-
-    def detach(self) -> "Factorised":
-        """The same with hyperparameters that are constants."""
-        return Factorised(self.model.detach(), self.factors)
 
 
 def factorise_all(model: DeepGP) -> Factorised:

@@ -20,6 +20,7 @@ from gym_dgpmpc.inference import sghmc
 from gym_dgpmpc.inference.sampler import Chains, ChainState, flatten
 from gym_dgpmpc.inference.settings import InferenceSettings
 from tests.oracles import sghmc as oracle
+from tests.oracles.models import chains as side_by_side
 from tests.oracles.models import normal, seeded
 
 X = torch.tensor([[-1.2], [-0.8], [-0.3], [0.1], [0.5], [1.1]], dtype=torch.float64)
@@ -89,7 +90,7 @@ def test_chains_that_start_in_the_posterior_stay_in_it(gibbs_every, exact):
     at each step make the standard deviations twice as large.
     """
     generator, one = seeded(2), two_layers()
-    model = one.at_all(NUM_CHAINS)
+    model = side_by_side(*[one] * NUM_CHAINS)
     state = ChainState(sghmc.init(exact.position), sghmc.init(flatten(model.parameters())), [exact.latent.clone()])
     settings = InferenceSettings(step_size=0.08, decay=0.1, gibbs_every=gibbs_every)
     chains, seen = Chains(model, state, Data(X, Y), settings, 0), []

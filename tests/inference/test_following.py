@@ -212,7 +212,7 @@ def test_moves_leave_the_latents_law_as_it_is():
     assert ((first_moment.abs() > 0.2) | ((second - 1.0).abs() > 0.2)).all(), "the data say something of each"
     latent = nodes[torch.multinomial(law, num_chains, replacement=True, generator=generator)].mT.unsqueeze(-1)
 
-    factorised = factorise_all(one.at_all(num_chains))
+    factorised = factorise_all(chains(*[one] * num_chains))
     position, latents = whitened.expand(num_chains, -1), [latent.float()]
     following = follower(factorised, position)
     for _ in range(20):

@@ -170,7 +170,7 @@ def test_the_particles_of_one_plan_spread_as_the_conditional_says(kernel, refres
     (factor,), v = factorised.factors, normal(generator, 40, 2)
     near = layer.inducing_inputs[:20] + 0.3 * normal(generator, 20, 3)
     x = torch.cat([near, 1.5 * normal(generator, 20, 3)])
-    particles = Factorised(model.at_all(num_particles), [factor.expand(num_particles, -1, -1)])
+    particles = Factorised(chains(*[model] * num_particles), [factor.expand(num_particles, -1, -1)])
     posterior = Posterior(particles, [v.expand(num_particles, -1, -1)])
     sampler = PathwiseSampler(posterior, COORDINATES, 1, num_features, refresh, torch.float64, generator)
     raw = INPUTS.inverse(x)
