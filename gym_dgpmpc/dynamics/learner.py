@@ -1,6 +1,5 @@
 """The base of models that are fitted to encoded transitions: the encoding, and whether there was a fit yet."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Generic, TypeVar
 
@@ -22,7 +21,7 @@ ROWS_AT_ONCE = 1000
 """Transitions that `predictive` looks at together, so that memory stays small."""
 
 
-class Learner(ABC, Generic[Fitted]):
+class Learner(Generic[Fitted]):
     """Base of a `DynamicsModel` that keeps what a fit left in ``_fitted``.
 
     Transitions and states of rollouts may be float64: see `takes_float64`.
@@ -133,6 +132,7 @@ class Learner(ABC, Generic[Fitted]):
         Raises:
             RuntimeError: the model was not fitted.
             ValueError: there are no transitions.
+            NotImplementedError: the model's class has no predictive density.
         """
         self._require_fit("predict")
         x, y = self._encode(data)
@@ -142,9 +142,11 @@ class Learner(ABC, Generic[Fitted]):
         ]
         return Predictive(*(torch.cat(parts) for parts in zip(*by_rows, strict=True)))
 
-    @abstractmethod
     def _mixture(self, x: Float[Tensor, "n D"], generator: torch.Generator) -> Mixture:
-        """The predictive density of the targets, both in raw units, float64."""
+        """The predictive density of the targets, both in raw units, float64; a model that only plans needs none."""
+        raise NotImplementedError(
+            f"{type(self).__name__} has no predictive density: define {type(self).__name__}._mixture"
+        )
 
     def _require_fit(self, verb: str) -> Fitted:
         if self._fitted is None:
