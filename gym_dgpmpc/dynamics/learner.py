@@ -144,9 +144,8 @@ class Learner(Generic[Fitted]):
 
     def _mixture(self, x: Float[Tensor, "n D"], generator: torch.Generator) -> Mixture:
         """The predictive density of the targets, both in raw units, float64; a model that only plans needs none."""
-        raise NotImplementedError(
-            f"{type(self).__name__} has no predictive density: define {type(self).__name__}._mixture"
-        )
+        name = type(self).__name__
+        raise NotImplementedError(f"{name} has no predictive density: define {name}._mixture")
 
     def _require_fit(self, verb: str) -> Fitted:
         if self._fitted is None:
