@@ -20,6 +20,7 @@ from torch import Tensor
 
 from gym_dgpmpc.gp.deep_gp import Factorised, log_likelihood
 from gym_dgpmpc.gp.kernels import Kernel, sqdist
+from gym_dgpmpc.gp.projection import linear_covariance
 
 LEAST_VARIANCE = 1e-12
 """Of an inner layer, so that the square root's gradient stays finite where the variance vanishes."""
@@ -37,6 +38,8 @@ class LayerTerms(NamedTuple):
     """L^-1 of the correlations, L L^T = r(Z, Z) + jitter."""
     own_slope: Float[Tensor, "C M M"]
     """dk/d(r^2) between the inducing inputs."""
+    linear: Float[Tensor, "C D"] | None
+    """Variances of the slopes of the kernel's linear part."""
 
 
 class Seen(NamedTuple):
@@ -75,7 +78,7 @@ def layer_terms(factorised: Factorised) -> list[LayerTerms]:
         eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
         unit = factor / variance.sqrt()
         inverse = torch.linalg.solve_triangular(unit, eye.expand_as(unit), upper=False)
-        terms.append(LayerTerms(layer.kernel, lengthscale, variance, centres, inverse, own_slope))
+        terms.append(LayerTerms(layer.kernel, lengthscale, variance, centres, inverse, own_slope, layer.slope_variance))
     return terms
 
 
@@ -83,13 +86,16 @@ def see(terms: LayerTerms, x: Float[Tensor, "C n D"]) -> Seen:
     """What a layer needs of its inputs."""
     scaled = x / terms.lengthscale
     value, slope = terms.kernel.correlation_and_slope(sqdist(scaled, terms.centres))
+    if terms.linear is not None:
+        value = value + linear_covariance(scaled, terms.centres, terms.linear)
     return Seen(scaled, terms.inverse @ value.mT, slope)
 
 
 def moments(terms: LayerTerms, whitened: Float[Tensor, "C M O"], seen: Seen, least: float) -> Passed:
     """Conditional mean and variance, the latter not below ``least``."""
     mean = terms.variance.sqrt() * (seen.projected.mT @ whitened)
-    variance = terms.variance.squeeze(-1) * (1.0 - seen.projected.square().sum(-2))
+    own = 1.0 if terms.linear is None else 1.0 + (seen.scaled.square() * terms.linear.unsqueeze(-2)).sum(-1)
+    variance = terms.variance.squeeze(-1) * (own - seen.projected.square().sum(-2))
     return Passed(seen, mean, variance.clamp_min(least))
 
 
@@ -171,11 +177,20 @@ def gradients(
         if index == 0 and not of_parameters:
             break
         projected_bar = scale * (v @ mean_bar.mT) - 2.0 * layer.variance * seen.projected * variance_bar.unsqueeze(-2)
-        by_distance = (layer.inverse.mT @ projected_bar).mT * seen.slope
+        value_bar = (layer.inverse.mT @ projected_bar).mT
+        by_distance = value_bar * seen.slope
         # d |x_i - z_j|^2 / d x_i = 2 (x_i - z_j), summed over the j.
         scaled_bar = 2.0 * (by_distance.sum(-1, keepdim=True) * seen.scaled - by_distance @ layer.centres)
+        by_own_variance = (layer.variance.squeeze(-1) * variance_bar).unsqueeze(-1)
+        if layer.linear is not None:
+            along = value_bar @ layer.centres + 2.0 * by_own_variance * seen.scaled
+            scaled_bar += along * layer.linear.unsqueeze(-2)
         if of_parameters:
-            centres_bar = _centres_gradient(layer, seen, by_distance, projected_bar)
+            centres_bar, linear_bar = _centres_gradient(layer, seen, by_distance, value_bar, projected_bar)
+            if linear_bar is not None:
+                assert layer.linear is not None
+                linear_bar += (by_own_variance * seen.scaled.square()).sum(-2)
+                parameters_bar = [2.0 * layer.linear * linear_bar, *parameters_bar]
             log_lengthscale_bar = -((centres_bar * layer.centres).sum(-2) + (scaled_bar * seen.scaled).sum(-2))
             log_variance_bar = 0.5 * (mean_bar * mean).sum((-2, -1)) + (variance_bar * variance).sum(-1)
             parameters_bar = [centres_bar / layer.lengthscale, log_lengthscale_bar, log_variance_bar, *parameters_bar]
@@ -190,14 +205,24 @@ def gradients(
 
 
 def _centres_gradient(
-    layer: LayerTerms, seen: Seen, by_distance: Float[Tensor, "C n M"], projected_bar: Float[Tensor, "C M n"]
-) -> Float[Tensor, "C M D"]:
-    """Of the scaled inducing inputs: as `gp.projection` has it, which says where it comes from."""
+    layer: LayerTerms,
+    seen: Seen,
+    by_distance: Float[Tensor, "C n M"],
+    value_bar: Float[Tensor, "C n M"],
+    projected_bar: Float[Tensor, "C M n"],
+) -> tuple[Float[Tensor, "C M D"], Float[Tensor, "C D"] | None]:
+    """Of the scaled inducing inputs and the slopes' variances: as `gp.projection` has it, which says where from."""
     centres = layer.centres
     points = by_distance.sum(-2).unsqueeze(-1) * centres - by_distance.mT @ seen.scaled
     lower = (projected_bar @ seen.projected.mT).tril()
     lower.diagonal(dim1=-2, dim2=-1).mul_(0.5)
     covariance_bar = -(layer.inverse.mT @ lower @ layer.inverse)
-    by_own_distance = 0.5 * (covariance_bar + covariance_bar.mT) * layer.own_slope
+    symmetric = 0.5 * (covariance_bar + covariance_bar.mT)
+    by_own_distance = symmetric * layer.own_slope
     own = by_own_distance.sum(-1, keepdim=True) * centres - by_own_distance @ centres
-    return 2.0 * points + 4.0 * own
+    centres_bar = 2.0 * points + 4.0 * own
+    if layer.linear is None:
+        return centres_bar, None
+    seen_from, seen_own = value_bar.mT @ seen.scaled, symmetric @ centres
+    centres_bar += (seen_from + 2.0 * seen_own) * layer.linear.unsqueeze(-2)
+    return centres_bar, (centres * (seen_from + seen_own)).sum(-2)
