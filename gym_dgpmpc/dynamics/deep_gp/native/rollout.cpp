@@ -62,6 +62,7 @@ struct Task {
   const float *carried, *shift;                        // [S]: s' = carried s + shift + spread out[target]
   const float *spread;                                 // [S]
   const int64_t *target;                               // [S]: which output, or -1
+  const float *lowest, *highest;                       // [T]: bounds of the outputs, noise included
   int64_t num_vectors;
   const int64_t *vectors;       // [num_vectors, 3]: where heading, x and y are; what is added to x, y is along the body
   const Layer *layers;                                 // [L]
@@ -369,12 +370,15 @@ void run(const Task &task, int64_t particle, int64_t first, int64_t last, vec *s
         if (l + 1 < task.num_layers)
           for (int64_t i = 0; i < inputs * VECTORS; i++) input[i] += out[i];
       }
+      const int64_t outputs = task.layers[task.num_layers - 1].outputs;
       if (task.noise) {
-        const int64_t outputs = task.layers[task.num_layers - 1].outputs;
         const float *noise = task.noise + (step * task.num_particles + particle) * outputs;
         for (int64_t o = 0; o < outputs; o++)
           for (int v = 0; v < VECTORS; v++) out[o * VECTORS + v] += noise[o];
       }
+      for (int64_t o = 0; o < outputs; o++)
+        for (int v = 0; v < VECTORS; v++)
+          out[o * VECTORS + v] = clamped(out[o * VECTORS + v], task.lowest[o], task.highest[o]);
       decode(task, out, state, moved);
     }
   }
