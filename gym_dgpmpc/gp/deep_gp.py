@@ -66,7 +66,7 @@ class DeepGP(NamedTuple):
     def with_parameters(self, parameters: Sequence[Tensor]) -> "DeepGP":
         """The same kernels with other tensors, given in the order of `parameters`."""
         each = iter(parameters)
-        layers = [layer._replace(**{name: next(each) for name in layer.parameters()}) for layer in self.layers]
+        layers = [Layer(layer.kernel, *(next(each) for _ in layer.parameters())) for layer in self.layers]
         return DeepGP(tuple(layers), next(each))
 
     def at(self, chain: Int[Tensor, "n"]) -> "DeepGP":

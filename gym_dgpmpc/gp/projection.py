@@ -70,8 +70,8 @@ class _Projection(torch.autograd.Function):
 
 
 def linear_covariance(
-    x: Float[Tensor, "*p n D"], z: Float[Tensor, "*c M D"], slope_variance: Float[Tensor, "*c D"]
-) -> Float[Tensor, "*p n M"]:
+    x: Float[Tensor, "*p n D"], z: Float[Tensor, "*c m D"], slope_variance: Float[Tensor, "*s D"]
+) -> Float[Tensor, "*p n m"]:
     """x S z^T of linear functions whose slopes have the variances S."""
     return (x * slope_variance.unsqueeze(-2)) @ z.mT
 

@@ -38,6 +38,7 @@ def log_variance_centre(*, last: bool) -> float:
 def are_plausible(model: DeepGP) -> bool:
     """Whether kernel and noise variances are finite and not absurd. Long lengthscales, and no noise, are no fault."""
     variances = [layer.log_variance for layer in model.layers] + [model.log_noise]
+    variances += [2.0 * layer.log_slope for layer in model.layers if layer.log_slope is not None]
     return all(bool((value < LARGEST).all()) for value in variances)
 
 

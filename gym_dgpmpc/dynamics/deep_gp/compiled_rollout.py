@@ -41,6 +41,7 @@ class PathwiseLayer(NamedTuple):
     phases: Float[Tensor, "P F"]
     kernel_out: Float[Tensor, "T P O M"]  # sigma^2 alpha; T = H with refresh="step", else 1
     feature_out: Float[Tensor, "T P O F"]  # sigma sqrt(2 / F) w
+    linear_out: Float[Tensor, "T P O D"] | None  # of a linear part, for x over the lengthscales
 
 
 class _Layer(ctypes.Structure):
@@ -55,6 +56,7 @@ class _Layer(ctypes.Structure):
         ("phases", _Floats),
         ("kernel_out", _Floats),
         ("feature_out", _Floats),
+        ("linear_out", _Floats),
     )
 
 
@@ -252,6 +254,7 @@ class CompiledRollout:
             self._floats(padded.phases),
             self._floats(padded.kernel_out),
             self._floats(padded.feature_out),
+            None if padded.linear_out is None else self._floats(padded.linear_out),
         )
 
     def _floats(self, values: Tensor) -> "ctypes._Pointer[ctypes.c_float]":

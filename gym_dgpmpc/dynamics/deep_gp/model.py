@@ -74,6 +74,8 @@ class DeepGPDynamics(Learner[Fitted]):
         num_layers: layers of the deep GP, L; with 1 it is an ordinary sparse GP.
         kernel: covariance function of every layer, from the smoothest functions to the roughest: rbf, matern72,
             matern52, matern32 or matern12.
+        linear: add a linear part to the last layer's kernel, whose slopes are inferred with all else: far from all
+            data the model goes on along a line, instead of back to the mean.
         num_inducing: inducing points per layer, M; more of them follow finer detail and cost more time.
         draw: how a world is drawn from the posterior: "pathwise" (whole functions), "joint" (values, jointly over the
             candidate sequences, as in the paper) or "marginal" (values, each candidate on its own).
@@ -124,6 +126,7 @@ class DeepGPDynamics(Learner[Fitted]):
         *,
         num_layers: int = 2,
         kernel: str = "matern32",
+        linear: bool = False,
         num_inducing: int = 100,
         draw: Draw = "pathwise",
         refresh: Refresh = "plan",
@@ -165,7 +168,8 @@ class DeepGPDynamics(Learner[Fitted]):
         noise = {"add_noise": add_noise, "split_noise": split_noise}
         super().__init__(observation_size, action_size, observation_spec, dtype, device, **noise)
         self.kernel: Kernel = find_kernel(kernel)
-        self.num_layers, self.num_inducing, self.num_features = num_layers, num_inducing, num_features
+        self.num_layers, self.linear = num_layers, linear
+        self.num_inducing, self.num_features = num_inducing, num_features
         self.draw_kind, self.refresh = draw, refresh
         self.first_training_iterations, self.training_iterations = first_training_iterations, training_iterations
         self.num_chains, self.num_samples, self.sample_spacing = num_chains, num_samples, sample_spacing
@@ -188,9 +192,8 @@ class DeepGPDynamics(Learner[Fitted]):
         normalisers, standardised = self._standardised(data)
         if self._fitted is None:
             iterations, settled = self.first_training_iterations, False
-            model = initial_model(
-                self.kernel, standardised, self.num_layers, self.num_inducing, self.num_chains, generator
-            )
+            sizes = self.num_layers, self.num_inducing, self.num_chains
+            model = initial_model(self.kernel, standardised, *sizes, generator, linear=self.linear)
             whitened = sghmc.init(standardised.x.new_zeros(self.num_chains, model.num_whitened()))
         else:
             iterations, settled, last = self.training_iterations, True, self._fitted
@@ -340,6 +343,7 @@ class DeepGPDynamics(Learner[Fitted]):
             num_samples=self._samples_of_chain,
             num_inputs=self.encoder.input_size,
             num_targets=self.encoder.target_size,
+            linear=self.linear,
         )
         self._fitted, self._follower = take_fitted(state, self.kernel, expected, self.device), None
 

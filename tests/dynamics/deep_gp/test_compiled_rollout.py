@@ -53,6 +53,7 @@ class Draw:
         offset=0.0,
         with_noise=False,
         seen=None,
+        linear=False,
     ):
         generator = seeded(3)
         encoder = Encoder(3, 2, spec)
@@ -64,7 +65,7 @@ class Draw:
         inputs.mean[: len(encoder.plain)] += (torch.zeros(3).double() + offset)[encoder.plain]
         targets.mean.add_(((torch.zeros(3).double() + offset) * (1.0 - encoder.carried))[encoder.predicted])
         sizes = num_layers, encoder.input_size, encoder.target_size, num_inducing
-        model = chains(*(make_model(*sizes, generator) for _ in range(PARTICLES)))
+        model = chains(*(make_model(*sizes, generator, linear=linear) for _ in range(PARTICLES)))
         names = kernel if isinstance(kernel, tuple) else (kernel,) * num_layers
         layers = zip(model.layers, names, strict=True)
         model = model._replace(layers=tuple(layer._replace(kernel=KERNELS[name]) for layer, name in layers))
@@ -104,6 +105,15 @@ def errors(draw, actions):
     exact = torch.stack([draw.double(found[t].double(), actions[:, t].double(), t) for t in range(HORIZON)])
     by_torch = torch.stack([draw.single(found[t].clone(), actions[:, t], t) for t in range(HORIZON)])
     return (found[1:] - exact).abs().max(), (by_torch - exact).abs().max()
+
+
+@pytest.mark.parametrize("num_layers", [1, 3])
+@pytest.mark.parametrize("refresh", ["step", "plan"])
+def test_a_linear_part_is_as_exact(num_layers, refresh):
+    draw = Draw("matern32", num_layers, refresh=refresh, linear=True)
+    compiled, by_torch = errors(draw, draw.actions(40))
+    assert compiled < max(10 * by_torch, 1e-5)
+    assert all((layer.linear_out is not None) == (layer is draw.single.layers[-1]) for layer in draw.single.layers)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
