@@ -15,13 +15,14 @@ import torch
 from gym_dgpmpc import compiler
 from gym_dgpmpc.dynamics.deep_gp import compiled_rollout
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
+from gym_dgpmpc.inference import compiled_layers
 from gym_dgpmpc.types import TrajectorySampler, Transitions
 from tests.oracles.models import normal, seeded
 
 needs_compiler = pytest.mark.skipif(not compiled_rollout.is_available(), reason="no C++ compiler works here")
 
 SOURCE = compiled_rollout.SOURCE
-REMEMBERED = compiler.load, compiler.warn_once, compiled_rollout._library
+REMEMBERED = compiler.load, compiler.warn_once, compiled_rollout._library, compiled_layers._library
 
 
 @pytest.fixture(autouse=True)
@@ -46,23 +47,22 @@ def test_without_a_compiler_one_warning_and_the_same_worlds(monkeypatch, command
     monkeypatch.setenv("CXX", command)
     model = DeepGPDynamics(3, 2, num_inducing=5, first_training_iterations=2, num_samples=2)
     observation = normal(seeded(), 10, 3).float()
-    model.fit(Transitions(observation, observation[:, :2], observation), seeded())
     with pytest.warns(UserWarning, match=complaint):
+        model.fit(Transitions(observation, observation[:, :2], observation), seeded())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         world = model.draw(2, 3, seeded())
     assert not isinstance(world, TrajectorySampler)
     assert world(observation.expand(2, -1, -1).clone(), observation[:, :2], 0).isfinite().all()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        model.draw(2, 3, seeded())
 
 
 def test_who_does_not_want_it_is_not_warned(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     model = DeepGPDynamics(3, 2, num_inducing=5, first_training_iterations=2, num_samples=2, compile=False)
     observation = normal(seeded(), 10, 3).float()
-    model.fit(Transitions(observation, observation[:, :2], observation), seeded())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        model.fit(Transitions(observation, observation[:, :2], observation), seeded())
         model.draw(2, 3, seeded())
 
 
@@ -202,6 +202,7 @@ def test_memory_that_cannot_be_had_is_an_error(monkeypatch):
             return 1
 
     monkeypatch.setattr(compiled_rollout, "_library", functools.cache(Library))
+    monkeypatch.setattr(compiled_layers, "can_take", lambda *_: False)
     model = DeepGPDynamics(3, 2, num_inducing=5, first_training_iterations=2, num_samples=2, compile=True)
     observation = normal(seeded(), 10, 3).float()
     model.fit(Transitions(observation, observation[:, :2], observation), seeded())

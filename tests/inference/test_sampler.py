@@ -14,7 +14,7 @@ from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.gp.layer import conditional
 from gym_dgpmpc.inference import sampler, sghmc
 from gym_dgpmpc.inference.diagnostics import effective_sample_size
-from gym_dgpmpc.inference.gradients import forward, gradients, layer_terms
+from gym_dgpmpc.inference.gradients import forward, gradients, prepare
 from gym_dgpmpc.inference.sampler import LAST_LEARNING_RATE, Chains, initial_state
 from gym_dgpmpc.inference.settings import InferenceSettings
 from tests.oracles import sghmc as oracle
@@ -90,14 +90,12 @@ def test_gradients_of_minibatches_are_unbiased():
     models, data = two_layers()
     model = chains(*models)
     whitened, latent = normal(seeded(1), 2, model.num_whitened()), normal(seeded(2), 2, 9, 2)
-    factorised, terms = factorise_all(model), layer_terms(factorise_all(model))
+    prepared = prepare(model)
 
     def of(rows):
         batch = data.rows(rows)
-        passed = forward(terms, model.split(whitened), batch.x.expand(2, -1, -1), [latent[:, rows]])
-        found = gradients(
-            factorised, terms, model.split(whitened), passed, [latent[:, rows]], batch.y, of_parameters=True
-        )
+        passed = forward(prepared, model.split(whitened), batch.x.expand(2, -1, -1), [latent[:, rows]])
+        found = gradients(prepared, model.split(whitened), passed, [latent[:, rows]], batch.y, of_parameters=True)
         return torch.cat([found.whitened, sampler.flatten(found.parameters)], dim=1)
 
     singles = torch.stack([of(torch.tensor([n])) for n in range(9)])
@@ -308,10 +306,9 @@ def test_hyperparameters_that_are_optimised_follow_the_likelihood(seen_gradients
     run = started(models, data, settings)
     before, position = run.state.parameters.position.clone(), run.state.whitened.position.clone()
     together = chains(*models)
-    factorised = factorise_all(together)
-    terms, split = layer_terms(factorised), together.split(position)
-    passed = forward(terms, split, data.x.expand(2, -1, -1), [])
-    uphill = sampler.flatten(gradients(factorised, terms, split, passed, [], data.y, of_parameters=True).parameters)
+    prepared, split = prepare(together), together.split(position)
+    passed = forward(prepared, split, data.x.expand(2, -1, -1), [])
+    uphill = sampler.flatten(gradients(prepared, split, passed, [], data.y, of_parameters=True).parameters)
     run.step(seeded())
     step = run.state.parameters.position - before
     # Without a burn-in the learning rate is at its end from the first step on.

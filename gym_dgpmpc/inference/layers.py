@@ -1,0 +1,166 @@
+"""One layer of C chains: what its points are to it, their moments, and the gradients of these, in closed form.
+
+`gradients.py` composes layers. Compiled code does the same (`compiled_layers.py`) where there is any; what stands here
+in PyTorch is for GPUs, for kernels of your own, and for machines without a compiler.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gym_dgpmpc.gp.kernels import Kernel, sqdist
+from gym_dgpmpc.gp.layer import Layer
+from gym_dgpmpc.gp.linalg import cholesky
+from gym_dgpmpc.inference import compiled_layers
+from gym_dgpmpc.inference.compiled_layers import CompiledLayer
+
+
+class LayerTerms(NamedTuple):
+    """What all evaluations under the same hyperparameters share of a layer."""
+
+    kernel: Kernel
+    lengthscale: Float[Tensor, "C 1 D"]
+    variance: Float[Tensor, "C 1 1"]
+    centres: Float[Tensor, "C M D"]
+    """Inducing inputs over the lengthscales."""
+    factor: Float[Tensor, "C M M"]
+    """L of the correlations, L L^T = r(Z, Z) + jitter."""
+    inverse: Float[Tensor, "C M M"]
+    """L^-1."""
+    own_slope: Float[Tensor, "C M M"]
+    """dk/d(r^2) between the inducing inputs."""
+    compiled: CompiledLayer | None
+    """What takes the place of PyTorch."""
+
+
+class Seen(NamedTuple):
+    """n points of each chain, seen by a layer."""
+
+    scaled: Float[Tensor, "C n D"]
+    projected: Float[Tensor, "C M n"]
+    """A = L^-1 r(Z, x)."""
+    slope: Float[Tensor, "C n M"]
+
+
+class Passed(NamedTuple):
+    """n points of each chain, passed through a layer."""
+
+    seen: Seen
+    mean: Float[Tensor, "C n O"]
+    variance: Float[Tensor, "C n"]
+
+
+class LayerGradients(NamedTuple):
+    """Of what a layer was given."""
+
+    whitened: Float[Tensor, "C M O"]
+    scaled: Float[Tensor, "C n D"] | None
+    """Of the points, over the lengthscales."""
+    centres: Float[Tensor, "C M D"] | None
+
+
+def layer_terms(layer: Layer, *, compile: bool = True) -> LayerTerms:
+    """The terms of a layer.
+
+    Raises:
+        FactorisationError: see `linalg.cholesky`.
+    """
+    lengthscale, variance = layer.lengthscale, layer.variance
+    centres = layer.inducing_inputs / lengthscale.unsqueeze(-2)
+    compiled = None
+    if compile and compiled_layers.can_take(layer.kernel, centres):
+        compiled = CompiledLayer(layer.kernel, lengthscale, variance, centres)
+        correlations, own_slope = compiled.own_correlations()
+    else:
+        correlations, own_slope = layer.kernel.correlation_and_slope(sqdist(centres, centres))
+    factor = cholesky(correlations, correlations.new_ones(()))
+    if compiled is not None:
+        inverse = compiled.invert(factor)
+    else:
+        eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+        inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
+    return LayerTerms(
+        layer.kernel, lengthscale.unsqueeze(-2), variance[:, None, None], centres, factor, inverse, own_slope, compiled
+    )
+
+
+def see(terms: LayerTerms, x: Float[Tensor, "C n D"]) -> Seen:
+    """What a layer needs of its inputs."""
+    if terms.compiled is not None:
+        return Seen(*terms.compiled.see(x))
+    scaled = x / terms.lengthscale
+    value, slope = terms.kernel.correlation_and_slope(sqdist(scaled, terms.centres))
+    return Seen(scaled, terms.inverse @ value.mT, slope)
+
+
+def moments(terms: LayerTerms, whitened: Float[Tensor, "C M O"], seen: Seen, least: float) -> Passed:
+    """Conditional mean and variance, the latter not below ``least``."""
+    if terms.compiled is not None:
+        return Passed(seen, *terms.compiled.moments(whitened, seen.projected, least))
+    mean = terms.variance.sqrt() * (seen.projected.mT @ whitened)
+    variance = terms.variance.squeeze(-1) * (1.0 - seen.projected.square().sum(-2))
+    return Passed(seen, mean, variance.clamp_min(least))
+
+
+def choose(first_one: Bool[Tensor, "C n"], one: Passed, other: Passed) -> Passed:
+    """Each point as it passed a layer one way or the other."""
+    by_row, by_column = first_one.unsqueeze(-1), first_one.unsqueeze(1)
+    seen = Seen(
+        torch.where(by_row, one.seen.scaled, other.seen.scaled),
+        torch.where(by_column, one.seen.projected, other.seen.projected),
+        torch.where(by_row, one.seen.slope, other.seen.slope),
+    )
+    variance = torch.where(first_one, one.variance, other.variance)
+    return Passed(seen, torch.where(by_row, one.mean, other.mean), variance)
+
+
+def layer_gradients(
+    terms: LayerTerms,
+    whitened: Float[Tensor, "C M O"],
+    seen: Seen,
+    mean_bar: Float[Tensor, "C n O"],
+    variance_bar: Float[Tensor, "C n"],
+    *,
+    of_points: bool = True,
+    of_centres: bool = True,
+) -> LayerGradients:
+    """Gradients from those of a layer's moments; of the points, and of the centres, only if they are wanted."""
+    if terms.compiled is not None:
+        found = terms.compiled.back(
+            whitened, seen, mean_bar, variance_bar, of_points=of_points, of_centres=of_centres
+        )  # fmt: skip
+        return LayerGradients(*found)
+    scale = terms.variance.sqrt()
+    whitened_bar = scale * (seen.projected @ mean_bar)
+    if not of_points and not of_centres:
+        return LayerGradients(whitened_bar, None, None)
+    projected_bar = scale * (whitened @ mean_bar.mT)
+    projected_bar -= 2.0 * terms.variance * seen.projected * variance_bar.unsqueeze(-2)
+    by_distance = (terms.inverse.mT @ projected_bar).mT * seen.slope
+    # d |x_i - z_j|^2 / d x_i = 2 (x_i - z_j), summed over the j.
+    scaled_bar = 2.0 * (by_distance.sum(-1, keepdim=True) * seen.scaled - by_distance @ terms.centres)
+    centres_bar = _centres_gradient(terms, seen, by_distance, projected_bar) if of_centres else None
+    return LayerGradients(whitened_bar, scaled_bar, centres_bar)
+
+
+def _centres_gradient(
+    terms: LayerTerms, seen: Seen, by_distance: Float[Tensor, "C n M"], projected_bar: Float[Tensor, "C M n"]
+) -> Float[Tensor, "C M D"]:
+    """Of the scaled inducing inputs: as `gp.projection` has it, which says where it comes from."""
+    centres = terms.centres
+    points = by_distance.sum(-2).unsqueeze(-1) * centres - by_distance.mT @ seen.scaled
+    lower = (projected_bar @ seen.projected.mT).tril()
+    lower.diagonal(dim1=-2, dim2=-1).mul_(0.5)
+    covariance_bar = -(terms.inverse.mT @ lower @ terms.inverse)
+    by_own_distance = 0.5 * (covariance_bar + covariance_bar.mT) * terms.own_slope
+    own = by_own_distance.sum(-1, keepdim=True) * centres - by_own_distance @ centres
+    return 2.0 * points + 4.0 * own
+
+
+def gram(terms: LayerTerms, seen: Seen, weights: Float[Tensor, "C T n"]) -> Float[Tensor, "C T M M"]:
+    """A diag(w) A^T for each row of weights."""
+    if terms.compiled is not None:
+        return terms.compiled.gram(seen.projected, weights)
+    return (seen.projected.unsqueeze(1) * weights.unsqueeze(2)) @ seen.projected.mT.unsqueeze(1)
