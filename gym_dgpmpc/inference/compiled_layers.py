@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import cache
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gym_dgpmpc import compiler
@@ -30,8 +30,8 @@ class _Layer(ctypes.Structure):
         ("lengthscale", _Doubles),
         ("variance", _Doubles),
         ("centres", _Doubles),
-        ("inverse", _Doubles),
         ("own_slope", _Doubles),
+        ("inverse", _Doubles),
     )
 
 
@@ -53,11 +53,13 @@ class _Points(ctypes.Structure):
 
 _ARGUMENTS = {
     "own_correlations": (_Doubles, _Doubles),
+    "factorise": (_Doubles, ctypes.c_double, _Doubles),
     "invert": (_Doubles, _Doubles),
     "see": (_Count, _Doubles, _Count, _Doubles, _Doubles, _Doubles),
     "moments": (_Count, _Doubles, _Count, _Doubles, ctypes.c_double, _Doubles, _Doubles),
     "back": (ctypes.POINTER(_Points),),
     "gram": (_Count, _Doubles, _Count, _Doubles, _Doubles),
+    "copy": (_Count, _Doubles, _Doubles, _Doubles),
 }
 """Of each function, between the layer and the range of chains."""
 
@@ -78,13 +80,16 @@ def can_take(kernel: Kernel, like: Tensor) -> bool:
 class CompiledLayer:
     """A layer whose kernel `can_take` knows.
 
+    Large matrices that come out are views of memory whose rows are whole vectors. Those that go in are copied to such
+    memory if they are not in it.
+
     Args:
         kernel: of all chains.
         lengthscale, variance: of each.
         centres: inducing inputs over the lengthscales.
 
     Raises:
-        MemoryError: by every method, where a few hundred kilobytes per thread could not be allocated.
+        MemoryError: by most methods, where some hundred kilobytes a thread could not be allocated.
     """
 
     def __init__(
@@ -100,20 +105,26 @@ class CompiledLayer:
         self._layer = _Layer(_kernel_number(kernel), self._size, self._inputs, *pointers)
 
     def own_correlations(self) -> tuple[Float[Tensor, "C M M"], Float[Tensor, "C M M"]]:
-        """r(Z, Z) and its slopes; they are kept for `back`."""
-        value, slope = (self._new(self._size, self._size) for _ in range(2))
+        """r(Z, Z) and its slopes; the latter are kept for `back`."""
+        value, slope = (self._large(self._size) for _ in range(2))
         self._call("own_correlations", value.data_ptr(), slope.data_ptr())
         self._kept_alive.append(slope)
         self._layer.own_slope = slope.data_ptr()
         return value, slope
 
+    def factorise(self, correlations: Float[Tensor, "C M M"], jitter: float) -> tuple[Float[Tensor, "C M M"], bool]:
+        """L of `own_correlations` and the jitter; and whether there is one."""
+        upper = self._large(self._size)
+        failed = self._failures("factorise", correlations.data_ptr(), jitter, upper.data_ptr())
+        return upper.mT, not failed
+
     def invert(self, factor: Float[Tensor, "C M M"]) -> Float[Tensor, "C M M"]:
-        """L^-1 of lower triangular matrices; it is kept for all that follows."""
-        by_column, inverse = factor.mT.contiguous(), self._new(self._size, self._size)
-        self._call("invert", by_column.data_ptr(), inverse.data_ptr())
-        self._kept_alive.append(inverse)
-        self._layer.inverse = inverse.data_ptr()
-        return inverse
+        """L^-1, of a factor that `factorise` gave; it is kept for all that follows."""
+        inverses = self._large(self._size, 2)
+        self._call("invert", factor.data_ptr(), inverses.data_ptr())
+        self._kept_alive.append(inverses)
+        self._layer.inverse = inverses.data_ptr()
+        return inverses[:, 0]
 
     def see(
         self, x: Float[Tensor, "C n D"]
@@ -121,7 +132,7 @@ class CompiledLayer:
         """The fields of `layers.Seen`."""
         x = x if x.stride()[1:] == (self._inputs, 1) else x.contiguous()  # chains that see the same need no copies
         num_points = x.shape[1]
-        scaled, projected, slope = (self._new(num_points, size) for size in (self._inputs, self._size, self._size))
+        scaled, projected, slope = self._new(num_points, self._inputs), self._large(num_points), self._large(num_points)
         pointers = (tensor.data_ptr() for tensor in (scaled, projected, slope))
         self._call("see", num_points, x.data_ptr(), x.stride(0), *pointers)
         return scaled, projected.mT, slope
@@ -130,7 +141,7 @@ class CompiledLayer:
         self, whitened: Float[Tensor, "C M O"], projected: Float[Tensor, "C M n"], least: float
     ) -> tuple[Float[Tensor, "C n O"], Float[Tensor, "C n"]]:
         """Mean and variance of `layers.Passed`."""
-        whitened, by_point = whitened.contiguous(), projected.mT.contiguous()
+        whitened, by_point = whitened.contiguous(), self._in_place(projected.mT)
         num_points, outputs = by_point.shape[1], whitened.shape[2]
         mean, variance = self._new(num_points, outputs), self._new(num_points)
         self._call(
@@ -151,8 +162,11 @@ class CompiledLayer:
     ) -> tuple[Float[Tensor, "C M O"], Float[Tensor, "C n D"] | None, Float[Tensor, "C M D"] | None]:
         """The fields of `layers.LayerGradients`; those of the points come with those of the centres."""
         scaled, projected, slope = seen
-        given = [t.contiguous() for t in (whitened, scaled, projected.mT, slope, mean_bar, variance_bar)]
         num_points, outputs = mean_bar.shape[1:]
+        given = (
+            whitened.contiguous(), scaled.contiguous(), self._in_place(projected.mT), self._in_place(slope),
+            mean_bar.contiguous(), variance_bar.contiguous(),
+        )  # fmt: skip
         whitened_bar = self._new(self._size, outputs)
         scaled_bar = self._new(num_points, self._inputs) if of_points or of_centres else None
         centres_bar = self._new(self._size, self._inputs) if of_centres else None
@@ -163,21 +177,44 @@ class CompiledLayer:
 
     def gram(self, projected: Float[Tensor, "C M n"], weights: Float[Tensor, "C T n"]) -> Float[Tensor, "C T M M"]:
         """A diag(w) A^T for each row of weights."""
-        by_point, weights = projected.mT.contiguous(), weights.contiguous()
+        by_point, weights = self._in_place(projected.mT), weights.contiguous()
         _, rows, num_points = weights.shape
         sums = self._new(rows, self._size, self._size)
         self._call("gram", num_points, by_point.data_ptr(), rows, weights.data_ptr(), sums.data_ptr())
         return sums
 
+    def put(self, chosen: Bool[Tensor, "C n"], rows: Float[Tensor, "C n M"], into: Float[Tensor, "C n M"]) -> Tensor:
+        """``into`` with those rows that are chosen; it is overwritten if its memory is padded."""
+        chosen, rows, into = chosen.contiguous(), self._in_place(rows), self._in_place(into)
+        self._call("copy", chosen.shape[1], chosen.data_ptr(), rows.data_ptr(), into.data_ptr())
+        return into
+
     def _new(self, *shape: int) -> Tensor:
         return self._kept_alive[0].new_empty(self._chains, *shape)
 
+    def _large(self, rows: int, *several: int) -> Tensor:
+        """An uninitialised "C n M" in padded memory."""
+        shape = _padded(rows), _padded(self._size)
+        return self._new(*several, *shape)[..., :rows, : self._size]
+
+    def _in_place(self, large: Float[Tensor, "C n M"]) -> Float[Tensor, "C n M"]:
+        """Itself if it is in padded memory, else a copy that is."""
+        _, rows, size = large.shape
+        height, width = _padded(rows), _padded(size)
+        if large.stride() == (height * width, width, 1):
+            return large
+        copied = large.new_zeros(len(large), height, width)[:, :rows, :size]
+        return copied.copy_(large)
+
     def _call(self, name: str, *arguments: object) -> None:
+        if self._failures(name, *arguments):
+            raise MemoryError("could not allocate the scratch space of a layer, some hundred kilobytes a thread")
+
+    def _failures(self, name: str, *arguments: object) -> int:
         function: Callable[..., int] = getattr(_library(), name)
         share = -(-self._chains // torch.get_num_threads())
         ranges = [(first, min(first + share, self._chains)) for first in range(0, self._chains, share)]
-        if compiler.in_threads(lambda first, last: function(self._layer, *arguments, first, last), ranges):
-            raise MemoryError("could not allocate the scratch space of a layer, some hundred kilobytes a thread")
+        return compiler.in_threads(lambda first, last: function(self._layer, *arguments, first, last), ranges)
 
 
 @cache
@@ -188,7 +225,8 @@ def _library() -> ctypes.CDLL | None:
             function = getattr(library, name)
             function.argtypes = (ctypes.POINTER(_Layer), *arguments, _Count, _Count)
             function.restype = _Count
-        library.kernel_number.argtypes, library.kernel_number.restype = (ctypes.c_char_p,), _Count
+        library.kernel_number.argtypes = (ctypes.c_char_p,)
+        library.kernel_number.restype = library.unit.restype = _Count
     return library
 
 
@@ -198,3 +236,12 @@ def _kernel_number(kernel: Kernel) -> int | None:
     library = _library()
     number = -1 if library is None else int(library.kernel_number(kernel.name.encode()))
     return None if number < 0 else number
+
+
+@cache
+def _padded(size: int) -> int:
+    """The rows or columns that a large matrix of so many takes."""
+    library = _library()
+    assert library is not None
+    unit = int(library.unit())
+    return -(-size // unit) * unit

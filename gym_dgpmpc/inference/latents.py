@@ -59,5 +59,6 @@ def move_latents(
     present, other = (likelihood(prepared, way, batch.y) for way in ways)
     uniform = torch.rand(present.shape, generator=generator, dtype=present.dtype, device=present.device)
     accepted = uniform.log() < other - present
-    passed = [first, *(choose(accepted, new, old) for old, new in zip(*(way[1:] for way in ways), strict=True))]
+    above = zip(prepared.layers[1:], *(way[1:] for way in ways), strict=True)
+    passed = [first, *(choose(layer, accepted, new, old) for layer, old, new in above)]
     return passed, [torch.where(accepted.unsqueeze(-1), new, old) for old, new in zip(latents, proposed, strict=True)]

@@ -73,12 +73,11 @@ def layer_terms(layer: Layer, *, compile: bool = True) -> LayerTerms:
     if compile and compiled_layers.can_take(layer.kernel, centres):
         compiled = CompiledLayer(layer.kernel, lengthscale, variance, centres)
         correlations, own_slope = compiled.own_correlations()
-    else:
-        correlations, own_slope = layer.kernel.correlation_and_slope(sqdist(centres, centres))
-    factor = cholesky(correlations, correlations.new_ones(()))
-    if compiled is not None:
+        factor = cholesky(correlations, factorise=compiled.factorise)
         inverse = compiled.invert(factor)
     else:
+        correlations, own_slope = layer.kernel.correlation_and_slope(sqdist(centres, centres))
+        factor = cholesky(correlations)
         eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
         inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
     return LayerTerms(
@@ -104,14 +103,16 @@ def moments(terms: LayerTerms, whitened: Float[Tensor, "C M O"], seen: Seen, lea
     return Passed(seen, mean, variance.clamp_min(least))
 
 
-def choose(first_one: Bool[Tensor, "C n"], one: Passed, other: Passed) -> Passed:
-    """Each point as it passed a layer one way or the other."""
+def choose(terms: LayerTerms, first_one: Bool[Tensor, "C n"], one: Passed, other: Passed) -> Passed:
+    """Each point as it passed a layer one way or the other; what the other way was may be overwritten."""
     by_row, by_column = first_one.unsqueeze(-1), first_one.unsqueeze(1)
-    seen = Seen(
-        torch.where(by_row, one.seen.scaled, other.seen.scaled),
-        torch.where(by_column, one.seen.projected, other.seen.projected),
-        torch.where(by_row, one.seen.slope, other.seen.slope),
-    )
+    if terms.compiled is not None:
+        projected = terms.compiled.put(first_one, one.seen.projected.mT, other.seen.projected.mT).mT
+        slope = terms.compiled.put(first_one, one.seen.slope, other.seen.slope)
+    else:
+        projected = torch.where(by_column, one.seen.projected, other.seen.projected)
+        slope = torch.where(by_row, one.seen.slope, other.seen.slope)
+    seen = Seen(torch.where(by_row, one.seen.scaled, other.seen.scaled), projected, slope)
     variance = torch.where(first_one, one.variance, other.variance)
     return Passed(seen, torch.where(by_row, one.mean, other.mean), variance)
 

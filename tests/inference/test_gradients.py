@@ -78,16 +78,17 @@ def test_how_points_pass_the_first_layer_may_be_given(num_layers):
         assert all(torch.equal(a, b) for a, b in zip(numbers(one), numbers(other), strict=True))
 
 
-def test_each_point_may_be_chosen_from_two_ways():
+@pytest.mark.parametrize("compile", [True, False])
+def test_each_point_may_be_chosen_from_two_ways(compile):
     """As it passes with the latents of that way, of each chain its own."""
     model, whitened, x, _, latents = problem(3)
     others = [normal(seeded(8 + index), *latent.shape) for index, latent in enumerate(latents)]
-    prepared, by_layer, points = prepare(model), model.split(whitened), x.expand(2, -1, -1)
+    prepared, by_layer, points = prepare(model, compile=compile), model.split(whitened), x.expand(2, -1, -1)
     mask = torch.rand(2, 17, generator=seeded(5)) < 0.5
     mixed = [torch.where(mask.unsqueeze(-1), *pair) for pair in zip(latents, others, strict=True)]
     ways = [forward(prepared, by_layer, points, each) for each in (latents, others, mixed)]
-    for one, other, expected in zip(*ways, strict=True):
-        found = choose(mask, one, other)
+    for layer, one, other, expected in zip(prepared.layers, *ways, strict=True):
+        found = choose(layer, mask, one, other)
         # The same sums, whose order may depend on where a point stands.
         for a, b in zip(numbers(found), numbers(expected), strict=True):
             torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-10)

@@ -1,12 +1,13 @@
 // One layer of C chains as training needs it, in double precision: kernel matrices, their products, and gradients.
 //
-// `inference/compiled_layers.py` calls this; `inference/gradients.py` has the same formulas in PyTorch, and says what
-// they are. Per chain there are M inducing inputs and n points of D numbers, and O outputs. A call takes the chains
+// `inference/compiled_layers.py` calls this; `inference/layers.py` has the same formulas in PyTorch, and says what they
+// are. Per chain there are M inducing inputs and n points of D numbers, and O outputs. A call takes the chains
 // first..last-1, which do not meet; several threads may call at the same time. Points are taken POINTS at a time, so
 // that what lies between two products stays in the cache, and a product with a triangular matrix leaves the zeros out.
 //
-// Matrices inside have rows padded with zeros to whole vectors (`padded`), those of the caller have not. Built on the
-// user's machine with its own vector width (GCC or Clang; see `compiler.py`). NaN goes through.
+// Large matrices have rows of whole vectors and whole blocks of rows, here and at the caller: [n', M'] and [M', M'],
+// with n' and M' as `padded` says. What stands beyond n and M is finite. Built on the user's machine with its own vector
+// width (GCC or Clang; see `compiler.py`). NaN goes through.
 
 #include <cmath>
 #include <cstdint>
@@ -36,13 +37,13 @@ extern "C" {
 
 // Of C chains, one after the other.
 struct Layer {
-  int64_t kernel;             // see `kernel_number`
+  int64_t kernel;                    // see `kernel_number`
   int64_t num_inducing, input_size;  // M, D
-  const double *lengthscale;  // [C, D]
-  const double *variance;     // [C]
-  const double *centres;      // [C, M, D], over the lengthscales
-  const double *inverse;      // [C, M, M], lower triangular
-  const double *own_slope;    // [C, M, M]
+  const double *lengthscale;         // [C, D]
+  const double *variance;            // [C]
+  const double *centres;             // [C, M, D], over the lengthscales
+  const double *own_slope;           // [C, M', M'], from `own_correlations`
+  const double *inverse;             // [C, 2, M', M'], from `invert`: lower triangular, and its transpose
 };
 }
 
@@ -181,14 +182,15 @@ struct Matrix {
   View transposed() const { return {values, 1, width}; }
 };
 
-// c += a b over k = begin..end-1, for ROWS rows and some vectors of columns, which stay in registers.
-template <int COUNT>
+// c += a b, or c = a b if not ADD, over k = begin..end-1, for ROWS rows and some vectors of columns, which stay in
+// registers.
+template <bool ADD, int COUNT>
 inline void tile(View a, Matrix b, Matrix c, int64_t i, int64_t j, int64_t begin, int64_t end) {
   vec sum[ROWS][COUNT];
 #pragma GCC unroll 8
   for (int r = 0; r < ROWS; r++)
 #pragma GCC unroll 3
-    for (int v = 0; v < COUNT; v++) sum[r][v] = at(c.row(i + r) + j + v * LANES);
+    for (int v = 0; v < COUNT; v++) sum[r][v] = ADD ? at(c.row(i + r) + j + v * LANES) : vec{};
   const double *left = a.values + i * a.row + begin * a.column;
   for (int64_t k = begin; k < end; k++, left += a.column) {
     vec right[COUNT];
@@ -209,47 +211,47 @@ struct Range {
   int64_t begin, end;
 };
 
-// c += a b for rows first..last-1 and all columns of c; `range(i, j)` says which k count for the rows from i and the
-// columns from j on, where j is the first and `j + VECTORS * LANES` beyond the last of a block. Columns are outside:
-// theirs of b stay in the nearest cache.
-template <class Ranges>
+// The product for rows first..last-1 and all columns of c; `ranges(i, j)` says which k count for the rows from i and
+// the columns from j on, where j is the first and `j + VECTORS * LANES` beyond the last of a block. Where none do c
+// stays. Columns are outside: theirs of b stay in the nearest cache.
+template <bool ADD = true, class Ranges>
 void product(View a, Matrix b, Matrix c, int64_t first, int64_t last, Ranges ranges) {
   for (int64_t j = 0; j < c.width; j += VECTORS * LANES)
     for (int64_t i = first; i < last; i += ROWS) {
       const Range range = ranges(i, j);
       if (range.begin >= range.end) continue;
       if (c.width - j >= VECTORS * LANES)
-        tile<VECTORS>(a, b, c, i, j, range.begin, range.end);
+        tile<ADD, VECTORS>(a, b, c, i, j, range.begin, range.end);
       else if (c.width - j >= 2 * LANES)
-        tile<2>(a, b, c, i, j, range.begin, range.end);
+        tile<ADD, 2>(a, b, c, i, j, range.begin, range.end);
       else
-        tile<1>(a, b, c, i, j, range.begin, range.end);
+        tile<ADD, 1>(a, b, c, i, j, range.begin, range.end);
     }
 }
 
 inline Range every(int64_t count) { return {0, count}; }
+inline int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
 inline int64_t larger(int64_t a, int64_t b) { return a > b ? a : b; }
+
+// One of the caller's large matrices, of which there are some one after the other.
+inline Matrix given(const double *values, int64_t rows, int64_t columns, int64_t index) {
+  return {const_cast<double *>(values) + index * padded(rows) * padded(columns), padded(columns)};
+}
 
 void clear(Matrix m, int64_t rows) { memset(m.values, 0, rows * m.width * sizeof(double)); }
 
-// Rows of the caller, `size` numbers each, into padded ones; zeros behind each, and in the rows up to `rows`.
+// Small rows of the caller, `size` numbers each, into padded ones; zeros behind each, and in the rows up to `rows`.
 void read(Matrix to, const double *from, int64_t count, int64_t size, int64_t rows) {
-  for (int64_t i = 0; i < rows; i++) {
-    const int64_t taken = i < count ? size : 0;
-    memcpy(to.row(i), from + i * size, taken * sizeof(double));
-    memset(to.row(i) + taken, 0, (to.width - taken) * sizeof(double));
-  }
+  clear(to, rows);
+  for (int64_t i = 0; i < count; i++)
+    for (int64_t j = 0; j < size; j++) to.row(i)[j] = from[i * size + j];
 }
 
-void write(double *to, Matrix from, int64_t count, int64_t size) {
-  for (int64_t i = 0; i < count; i++) memcpy(to + i * size, from.row(i), size * sizeof(double));
-}
-
-// The transpose of the caller's [rows, columns], padded.
-void read_transposed(Matrix to, const double *from, int64_t rows, int64_t columns) {
-  clear(to, padded(columns));
-  for (int64_t i = 0; i < rows; i++)
-    for (int64_t j = 0; j < columns; j++) to.row(j)[i] = from[i * columns + j];
+// The same, transposed.
+void read_transposed(Matrix to, const double *from, int64_t count, int64_t size) {
+  clear(to, padded(size));
+  for (int64_t i = 0; i < count; i++)
+    for (int64_t j = 0; j < size; j++) to.row(j)[i] = from[i * size + j];
 }
 
 // Memory for one call, cut into matrices. A first pass without memory finds how much is needed.
@@ -275,8 +277,8 @@ int64_t with_memory(const Layer &layer, int64_t outputs, Body body) {
   Buffers(needed, layer, outputs);
   void *memory = nullptr;
   if (posix_memalign(&memory, 64, needed.size() * sizeof(double))) return 1;
-  Memory given((double *)memory);
-  body(Buffers(given, layer, outputs));
+  Memory taken((double *)memory);
+  body(Buffers(taken, layer, outputs));
   free(memory);
   return 0;
 }
@@ -284,107 +286,152 @@ int64_t with_memory(const Layer &layer, int64_t outputs, Body body) {
 // What one chain has of a layer.
 struct Own {
   int64_t size, inputs;  // M, D
-  const double *lengthscale, *centres, *inverse, *own_slope;
+  const double *lengthscale, *centres;
   double variance;
+  Matrix slope, inverse, transposed;
   Own(const Layer &layer, int64_t chain)
       : size(layer.num_inducing),
         inputs(layer.input_size),
         lengthscale(layer.lengthscale + chain * inputs),
         centres(layer.centres + chain * size * inputs),
-        inverse(layer.inverse + chain * size * size),
-        own_slope(layer.own_slope + chain * size * size),
-        variance(layer.variance[chain]) {}
+        variance(layer.variance[chain]),
+        slope(given(layer.own_slope, size, size, chain)),
+        inverse(given(layer.inverse, size, size, 2 * chain)),
+        transposed(given(layer.inverse, size, size, 2 * chain + 1)) {}
 };
 
-// Squared distances of ROWS-padded points x, times -2, with the squares of their lengths, to M centres (transposed).
-void distances(Matrix minus_twice, const double *squares, int64_t rows, Matrix centres, Matrix lengths, int64_t inputs,
-               Matrix out) {
-  for (int64_t i = 0; i < rows; i++)
-    for (int64_t j = 0; j < out.width; j += LANES) at(out.row(i) + j) = squares[i] + at(lengths.values + j);
-  product(minus_twice.view(), centres, out, 0, rows, [=](int64_t, int64_t) { return every(inputs); });
-}
+// Correlations, and their slopes, between points and the inducing inputs.
+struct CorrelationBuffers {
+  Matrix centres, lengths, points, squares;
+  CorrelationBuffers(Memory &memory, const Layer &layer, int64_t num_points)
+      : centres(memory.matrix(layer.input_size, layer.num_inducing)),
+        lengths(memory.matrix(1, layer.num_inducing)),
+        points(memory.matrix(num_points, layer.input_size)),
+        squares(memory.matrix(1, num_points)) {}
+};
 
 // The centres, transposed, and the squares of their lengths.
-void read_centres(const Own &own, Matrix centres, Matrix lengths) {
-  read_transposed(centres, own.centres, own.size, own.inputs);
-  clear(lengths, 1);
+void read_centres(const Own &own, const CorrelationBuffers &use) {
+  read_transposed(use.centres, own.centres, own.size, own.inputs);
+  clear(use.lengths, 1);
   for (int64_t d = 0; d < own.inputs; d++)
-    for (int64_t j = 0; j < centres.width; j += LANES)
-      at(lengths.values + j) += at(centres.row(d) + j) * at(centres.row(d) + j);
+    for (int64_t j = 0; j < use.centres.width; j += LANES)
+      at(use.lengths.values + j) += at(use.centres.row(d) + j) * at(use.centres.row(d) + j);
+}
+
+// Of some points, over the lengthscales; r^2 = |x|^2 + |z|^2 - 2 x.z.
+void correlate(const Layer &layer, const Own &own, const double *scaled, int64_t count, Matrix values, double *slopes,
+               const CorrelationBuffers &use) {
+  const int64_t rows = padded(count), inputs = own.inputs;
+  read(use.points, scaled, count, inputs, rows);
+  for (int64_t i = 0; i < rows; i++) {
+    double square = 0.0;
+    for (int64_t d = 0; d < inputs; d++) {
+      square += use.points.row(i)[d] * use.points.row(i)[d];
+      use.points.row(i)[d] *= -2.0;
+    }
+    square += square - square;  // NaN if infinite: such a point is none, rather than one that is far
+    for (int64_t j = 0; j < values.width; j += LANES) at(values.row(i) + j) = square + at(use.lengths.values + j);
+  }
+  product(use.points.view(), use.centres, values, 0, rows, [=](int64_t, int64_t) { return every(inputs); });
+  KERNELS::entries[layer.kernel].evaluate(values.values, slopes, rows * values.width);
+}
+
+// Upper triangular U = L^T with U^T U = m + jitter, row by row of blocks: what the rows above say of a block of rows,
+// then these one after the other. Returns whether it exists.
+bool factorise_chain(int64_t size, Matrix m, double jitter, Matrix upper) {
+  clear(upper, padded(size));
+  bool exists = true;
+  for (int64_t first = 0; first < size; first += ROWS) {
+    const int64_t end = smaller(first + ROWS, size);
+    for (int64_t i = first; i < end; i++) {
+      for (int64_t j = i; j < size; j++) upper.row(i)[j] = -m.row(i)[j];
+      upper.row(i)[i] -= jitter;
+    }
+    product(upper.transposed(), upper, upper, first, first + ROWS,
+            [=](int64_t, int64_t j) { return j + VECTORS * LANES > first ? every(first) : Range{0, 0}; });
+    for (int64_t i = first; i < end; i++) {
+      double *row = upper.row(i);
+      for (int64_t k = first; k < i; k++)
+        for (int64_t j = first; j < upper.width; j += LANES) at(row + j) += upper.row(k)[i] * at(upper.row(k) + j);
+      const double pivot = sqrt(-row[i]), scale = -1.0 / pivot;
+      exists = exists && pivot > 0.0 && pivot < HUGE_VAL;
+      for (int64_t j = first; j < upper.width; j += LANES) at(row + j) *= scale;
+      for (int64_t j = first; j < i; j++) row[j] = 0.0;
+    }
+    // Of columns before the block, and beyond the last, nothing is said.
+    for (int64_t i = first; i < first + ROWS; i++) {
+      memset(upper.row(i), 0, (i < end ? first : upper.width) * sizeof(double));
+      if (i < end) memset(upper.row(i) + size, 0, (upper.width - size) * sizeof(double));
+    }
+  }
+  return exists;
+}
+
+// L^-1 by forward substitution: what the rows above say of a block of rows, then these one after the other.
+void invert_chain(int64_t size, Matrix upper, Matrix inverse, Matrix transposed) {
+  const int64_t rows = padded(size);
+  clear(inverse, rows);
+  for (int64_t first = 0; first < size; first += ROWS) {
+    product(upper.transposed(), inverse, inverse, first, first + ROWS,
+            [=](int64_t, int64_t j) { return Range{j, first}; });
+    for (int64_t i = first; i < smaller(first + ROWS, size); i++) {
+      double *row = inverse.row(i);
+      for (int64_t k = first; k < i; k++)
+        for (int64_t j = 0; j < first + ROWS; j += LANES) at(row + j) += upper.row(k)[i] * at(inverse.row(k) + j);
+      row[i] -= 1.0;
+      const double scale = -1.0 / upper.row(i)[i];
+      for (int64_t j = 0; j < first + ROWS; j += LANES) at(row + j) *= scale;
+    }
+  }
+  for (int64_t i = 0; i < rows; i += ROWS)
+    for (int64_t j = 0; j < rows; j += ROWS)
+      for (int64_t k = i; k < i + ROWS; k++)
+        for (int64_t l = j; l < j + ROWS; l++) transposed.row(l)[k] = inverse.row(k)[l];
 }
 
 struct SeeBuffers {
-  Matrix centres, lengths, inverse, points, squares, values, slopes, projected;
+  CorrelationBuffers correlations;
+  Matrix values;
   SeeBuffers(Memory &memory, const Layer &layer, int64_t)
-      : centres(memory.matrix(layer.input_size, layer.num_inducing)),
-        lengths(memory.matrix(1, layer.num_inducing)),
-        inverse(memory.matrix(layer.num_inducing, layer.num_inducing)),
-        points(memory.matrix(POINTS, layer.input_size)),
-        squares(memory.matrix(1, POINTS)),
-        values(memory.matrix(POINTS, layer.num_inducing)),
-        slopes(memory.matrix(POINTS, layer.num_inducing)),
-        projected(memory.matrix(POINTS, layer.num_inducing)) {}
+      : correlations(memory, layer, POINTS), values(memory.matrix(POINTS, layer.num_inducing)) {}
 };
 
-// `rows` points, over the lengthscales, to the left factor of `distances`, and the squares of their lengths.
-void prepare(Matrix points, double *squares, int64_t rows, int64_t inputs) {
-  for (int64_t i = 0; i < rows; i++) {
-    squares[i] = 0.0;
-    for (int64_t d = 0; d < inputs; d++) {
-      squares[i] += points.row(i)[d] * points.row(i)[d];
-      points.row(i)[d] *= -2.0;
-    }
-    squares[i] += squares[i] - squares[i];  // NaN if infinite: such a point is none, rather than one that is far
-  }
-}
-
 void see_chain(const Layer &layer, const Own &own, const double *x, int64_t num_points, double *scaled,
-               double *projected, double *slope, const SeeBuffers &use) {
+               Matrix projected, Matrix slope, const SeeBuffers &use) {
   const int64_t size = own.size, inputs = own.inputs;
-  read_centres(own, use.centres, use.lengths);
-  read_transposed(use.inverse, own.inverse, size, size);
+  read_centres(own, use.correlations);
+  for (int64_t i = 0; i < num_points; i++)
+    for (int64_t d = 0; d < inputs; d++) scaled[i * inputs + d] = x[i * inputs + d] / own.lengthscale[d];
   for (int64_t p = 0; p < num_points; p += POINTS) {
-    const int64_t count = num_points - p < POINTS ? num_points - p : POINTS, rows = padded(count);
-    for (int64_t i = p; i < p + count; i++)
-      for (int64_t d = 0; d < inputs; d++) scaled[i * inputs + d] = x[i * inputs + d] / own.lengthscale[d];
-    read(use.points, scaled + p * inputs, count, inputs, rows);
-    prepare(use.points, use.squares.values, rows, inputs);
-    distances(use.points, use.squares.values, rows, use.centres, use.lengths, inputs, use.values);
-    KERNELS::entries[layer.kernel].evaluate(use.values.values, use.slopes.values, rows * use.values.width);
-    write(slope + p * size, use.slopes, count, size);
-    clear(use.projected, rows);
-    product(use.values.view(), use.inverse, use.projected, 0, rows, [=](int64_t, int64_t j) {
-      return every(j + VECTORS * LANES < size ? j + VECTORS * LANES : size);
-    });
-    write(projected + p * size, use.projected, count, size);
+    const int64_t count = smaller(num_points - p, POINTS);
+    correlate(layer, own, scaled + p * inputs, count, use.values, slope.row(p), use.correlations);
+    product<false>(use.values.view(), own.transposed, {projected.row(p), projected.width}, 0, padded(count),
+                   [=](int64_t, int64_t j) { return every(smaller(j + VECTORS * LANES, size)); });
   }
 }
 
 struct MomentBuffers {
-  Matrix whitened, projected, mean;
+  Matrix whitened, mean;
   MomentBuffers(Memory &memory, const Layer &layer, int64_t outputs)
-      : whitened(memory.matrix(layer.num_inducing, outputs)),
-        projected(memory.matrix(POINTS, layer.num_inducing)),
-        mean(memory.matrix(POINTS, outputs)) {}
+      : whitened(memory.matrix(layer.num_inducing, outputs)), mean(memory.matrix(POINTS, outputs)) {}
 };
 
-void moments_chain(const Own &own, int64_t outputs, const double *whitened, int64_t num_points,
-                   const double *projected, double least, double *mean, double *variance, const MomentBuffers &use) {
+void moments_chain(const Own &own, int64_t outputs, const double *whitened, int64_t num_points, Matrix projected,
+                   double least, double *mean, double *variance, const MomentBuffers &use) {
   const int64_t size = own.size;
-  read(use.whitened, whitened, size, outputs, padded(size));
   const double deviation = sqrt(own.variance);
-  for (int64_t i = 0; i < size; i++)
-    for (int64_t o = 0; o < outputs; o++) use.whitened.row(i)[o] *= deviation;
+  read(use.whitened, whitened, size, outputs, padded(size));
+  for (int64_t i = 0; i < size * use.whitened.width; i += LANES) at(use.whitened.values + i) *= deviation;
   for (int64_t p = 0; p < num_points; p += POINTS) {
-    const int64_t count = num_points - p < POINTS ? num_points - p : POINTS, rows = padded(count);
-    read(use.projected, projected + p * size, count, size, rows);
-    clear(use.mean, rows);
-    product(use.projected.view(), use.whitened, use.mean, 0, rows, [=](int64_t, int64_t) { return every(size); });
-    write(mean + p * outputs, use.mean, count, outputs);
+    const int64_t count = smaller(num_points - p, POINTS);
+    product<false>({projected.row(p), projected.width, 1}, use.whitened, use.mean, 0, padded(count),
+                   [=](int64_t, int64_t) { return every(size); });
     for (int64_t i = 0; i < count; i++) {
+      for (int64_t o = 0; o < outputs; o++) mean[(p + i) * outputs + o] = use.mean.row(i)[o];
       vec sum = {};
-      for (int64_t j = 0; j < use.projected.width; j += LANES)
-        sum += at(use.projected.row(i) + j) * at(use.projected.row(i) + j);
+      for (int64_t j = 0; j < projected.width; j += LANES)
+        sum += at(projected.row(p + i) + j) * at(projected.row(p + i) + j);
       double known = 0.0;
       for (int j = 0; j < LANES; j++) known += sum[j];
       const double left = own.variance * (1.0 - known);
@@ -399,18 +446,28 @@ void add_lower(Matrix left, Matrix right, int64_t rows, Matrix m, int64_t size) 
           [=](int64_t i, int64_t j) { return i + ROWS > j ? every(rows) : Range{0, 0}; });
 }
 
+struct Points {
+  int64_t count, outputs;      // n, O
+  const double *whitened;      // [C, M, O]
+  const double *scaled;        // [C, n, D]
+  const double *projected;     // [C, n', M']
+  const double *slope;         // [C, n', M']
+  const double *mean_bar;      // [C, n, O]
+  const double *variance_bar;  // [C, n]
+  double *whitened_bar;        // [C, M, O]
+  double *scaled_bar;          // [C, n, D], or null where neither it nor centres_bar is wanted
+  double *centres_bar;         // [C, M, D], or null
+};
+
 struct BackBuffers {
-  Matrix inverse, centres, whitened, projected, mean_bar, bar, product, slope, points, moved;
-  Matrix whitened_bar, lower, left, both, own, by_point;
+  Matrix centres, whitened, mean_bar, bar, by_distance, points, moved;
+  Matrix whitened_bar, lower, left, both, own, by_centre;
   BackBuffers(Memory &memory, const Layer &layer, int64_t outputs)
-      : inverse(memory.matrix(layer.num_inducing, layer.num_inducing)),
-        centres(memory.matrix(layer.num_inducing, layer.input_size + 1)),
+      : centres(memory.matrix(layer.num_inducing, layer.input_size + 1)),
         whitened(memory.matrix(outputs, layer.num_inducing)),
-        projected(memory.matrix(POINTS, layer.num_inducing)),
         mean_bar(memory.matrix(POINTS, outputs)),
         bar(memory.matrix(POINTS, layer.num_inducing)),
-        product(memory.matrix(POINTS, layer.num_inducing)),
-        slope(memory.matrix(POINTS, layer.num_inducing)),
+        by_distance(memory.matrix(POINTS, layer.num_inducing)),
         points(memory.matrix(POINTS, layer.input_size + 1)),
         moved(memory.matrix(POINTS, layer.input_size + 1)),
         whitened_bar(memory.matrix(outputs, layer.num_inducing)),
@@ -418,49 +475,40 @@ struct BackBuffers {
         left(memory.matrix(layer.num_inducing, layer.num_inducing)),
         both(memory.matrix(layer.num_inducing, layer.num_inducing)),
         own(memory.matrix(layer.num_inducing, layer.input_size + 1)),
-        by_point(memory.matrix(layer.input_size + 1, layer.num_inducing)) {}
+        by_centre(memory.matrix(layer.input_size + 1, layer.num_inducing)) {}
 };
 
-struct Points {
-  int64_t count, outputs;     // n, O
-  const double *whitened;     // [C, M, O]
-  const double *scaled;       // [C, n, D]
-  const double *projected;    // [C, n, M]
-  const double *slope;        // [C, n, M]
-  const double *mean_bar;     // [C, n, O]
-  const double *variance_bar; // [C, n]
-  double *whitened_bar;       // [C, M, O]
-  double *scaled_bar;         // [C, n, D], or null where neither it nor centres_bar is wanted
-  double *centres_bar;        // [C, M, D], or null
-};
+// Rows of the caller, with a last column of ones: with it the sums over a product's terms come with the product.
+void read_with_ones(Matrix to, const double *from, int64_t count, int64_t size, int64_t rows) {
+  read(to, from, count, size, rows);
+  for (int64_t i = 0; i < count; i++) to.row(i)[size] = 1.0;
+}
 
 // Of the centres: through their distances to the points, and through the factor of their own correlations.
 void centres_gradient(const Own &own, const BackBuffers &use, int64_t outputs, double *centres_bar) {
-  const int64_t size = own.size, inputs = own.inputs, all_rows = padded(size);
-  // `lower` has -2 variance A diag(variance_bar) A^T; now (L^-T mean_bar ...) of the means, a product of few columns.
-  product(use.whitened.transposed(), use.whitened_bar, use.lower, 0, all_rows,
-          [=](int64_t i, int64_t j) { return i + ROWS > j ? every(outputs) : Range{0, 0}; });
+  const int64_t size = own.size, inputs = own.inputs, rows = padded(size);
+  // `lower` has A_bar A^T so far as it comes from the variances; of the means it is a product of few columns.
+  add_lower(use.whitened, use.whitened_bar, outputs, use.lower, size);
   for (int64_t i = 0; i < size; i++) {
     use.lower.row(i)[i] *= 0.5;
     memset(use.lower.row(i) + i + 1, 0, (use.lower.width - i - 1) * sizeof(double));
   }
-  clear(use.left, all_rows);
-  product(use.lower.view(), use.inverse, use.left, 0, all_rows,
-          [=](int64_t i, int64_t j) { return Range{j, i + ROWS < size ? i + ROWS : size}; });
-  clear(use.both, all_rows);
-  product(use.inverse.transposed(), use.left, use.both, 0, all_rows,
-          [=](int64_t i, int64_t j) { return Range{larger(i, j), size}; });
-  // The symmetric part of it times the slope, which is symmetric, is half the sum of this and its transpose.
-  read(use.left, own.own_slope, size, size, all_rows);
-  for (int64_t i = 0; i < all_rows * use.both.width; i += LANES) at(use.both.values + i) *= at(use.left.values + i);
-  clear(use.own, all_rows);
+  clear(use.left, rows);
+  product(use.lower.view(), own.inverse, use.left, 0, rows,
+          [=](int64_t i, int64_t j) { return Range{j, smaller(i + ROWS, size)}; });
+  product<false>(own.inverse.transposed(), use.left, use.both, 0, rows,
+                 [=](int64_t i, int64_t j) { return Range{larger(i, j), size}; });
+  // Times the slope, which is symmetric; of the symmetric part this is half the sum of it and its transpose.
+  for (int64_t i = 0; i < rows * use.both.width; i += LANES) at(use.both.values + i) *= at(own.slope.values + i);
+  clear(use.own, rows);
   for (const View half : {use.both.view(), use.both.transposed()})
-    product(half, use.centres, use.own, 0, all_rows, [=](int64_t, int64_t) { return every(size); });
+    product(half, use.centres, use.own, 0, rows, [=](int64_t, int64_t) { return every(size); });
   for (int64_t i = 0; i < size; i++)
     for (int64_t d = 0; d < inputs; d++) {
       const double centre = own.centres[i * inputs + d];
-      const double points = use.by_point.row(inputs)[i] * centre - use.by_point.row(d)[i];
-      centres_bar[i * inputs + d] = 2.0 * points - 2.0 * (use.own.row(i)[inputs] * centre - use.own.row(i)[d]);
+      const double by_points = use.by_centre.row(inputs)[i] * centre - use.by_centre.row(d)[i];
+      const double by_centres = use.own.row(i)[inputs] * centre - use.own.row(i)[d];
+      centres_bar[i * inputs + d] = 2.0 * by_points - 2.0 * by_centres;
     }
 }
 
@@ -468,45 +516,37 @@ void back_chain(const Layer &layer, const Points &points, int64_t chain, const B
   const Own own(layer, chain);
   const int64_t size = own.size, inputs = own.inputs, outputs = points.outputs, num = points.count;
   const double deviation = sqrt(own.variance);
-  const double *projected = points.projected + chain * num * size, *slope = points.slope + chain * num * size;
   const double *scaled = points.scaled + chain * num * inputs, *mean_bar = points.mean_bar + chain * num * outputs;
   const double *variance_bar = points.variance_bar + chain * num;
+  const Matrix all_projected = given(points.projected, num, size, chain), slope = given(points.slope, num, size, chain);
   const bool further = points.scaled_bar, of_centres = points.centres_bar;
   read_transposed(use.whitened, points.whitened + chain * size * outputs, size, outputs);
+  read_with_ones(use.centres, own.centres, size, inputs, padded(size));
   clear(use.whitened_bar, padded(outputs));
-  if (further) {
-    read(use.inverse, own.inverse, size, size, padded(size));
-    read(use.centres, own.centres, size, inputs, padded(size));
-    for (int64_t i = 0; i < size; i++) use.centres.row(i)[inputs] = 1.0;
-    clear(use.lower, padded(size));
-    clear(use.by_point, padded(inputs + 1));
-  }
+  clear(use.lower, padded(size));
+  clear(use.by_centre, padded(inputs + 1));
   for (int64_t p = 0; p < num; p += POINTS) {
-    const int64_t count = num - p < POINTS ? num - p : POINTS, rows = padded(count);
+    const int64_t count = smaller(num - p, POINTS), rows = padded(count);
     const auto all_points = [=](int64_t, int64_t) { return every(rows); };
-    read(use.projected, projected + p * size, count, size, rows);
+    const Matrix projected = {all_projected.row(p), all_projected.width};
     read(use.mean_bar, mean_bar + p * outputs, count, outputs, rows);
     for (int64_t i = 0; i < rows * use.mean_bar.width; i += LANES) at(use.mean_bar.values + i) *= deviation;
-    product(use.mean_bar.transposed(), use.projected, use.whitened_bar, 0, padded(outputs), all_points);
+    product(use.mean_bar.transposed(), projected, use.whitened_bar, 0, padded(outputs), all_points);
     if (!further) continue;
     // The gradient of A by the variances, ...
     for (int64_t i = 0; i < rows; i++) {
       const double weight = i < count ? -2.0 * own.variance * variance_bar[p + i] : 0.0;
-      for (int64_t j = 0; j < use.bar.width; j += LANES)
-        at(use.bar.row(i) + j) = weight * at(use.projected.row(i) + j);
+      for (int64_t j = 0; j < use.bar.width; j += LANES) at(use.bar.row(i) + j) = weight * at(projected.row(i) + j);
     }
-    if (of_centres) add_lower(use.bar, use.projected, rows, use.lower, size);
-    // ... and by the means, of the correlations, and of the squared distances.
+    if (of_centres) add_lower(use.bar, projected, rows, use.lower, size);
+    // ... and by the means; then of the correlations, and of the squared distances.
     product(use.mean_bar.view(), use.whitened, use.bar, 0, rows, [=](int64_t, int64_t) { return every(outputs); });
-    clear(use.product, rows);
-    product(use.bar.view(), use.inverse, use.product, 0, rows,
-            [=](int64_t, int64_t j) { return Range{j, size}; });
-    read(use.slope, slope + p * size, count, size, rows);
-    for (int64_t i = 0; i < rows * use.slope.width; i += LANES)
-      at(use.product.values + i) *= at(use.slope.values + i);
-    // By a last column of ones the sums come with the products.
-    clear(use.moved, rows);
-    product(use.product.view(), use.centres, use.moved, 0, rows, [=](int64_t, int64_t) { return every(size); });
+    product<false>(use.bar.view(), own.inverse, use.by_distance, 0, rows,
+                   [=](int64_t, int64_t j) { return Range{j, size}; });
+    for (int64_t i = 0; i < rows * slope.width; i += LANES)
+      at(use.by_distance.values + i) *= at(slope.row(p) + i);
+    product<false>(use.by_distance.view(), use.centres, use.moved, 0, rows,
+                   [=](int64_t, int64_t) { return every(size); });
     for (int64_t i = 0; i < count; i++)
       for (int64_t d = 0; d < inputs; d++) {
         const int64_t n = (p + i) * inputs + d;
@@ -514,9 +554,8 @@ void back_chain(const Layer &layer, const Points &points, int64_t chain, const B
             2.0 * (use.moved.row(i)[inputs] * scaled[n] - use.moved.row(i)[d]);
       }
     if (!of_centres) continue;
-    read(use.points, scaled + p * inputs, count, inputs, rows);
-    for (int64_t i = 0; i < count; i++) use.points.row(i)[inputs] = 1.0;
-    product(use.points.transposed(), use.product, use.by_point, 0, padded(inputs + 1), all_points);
+    read_with_ones(use.points, scaled + p * inputs, count, inputs, rows);
+    product(use.points.transposed(), use.by_distance, use.by_centre, 0, padded(inputs + 1), all_points);
   }
   double *whitened_bar = points.whitened_bar + chain * size * outputs;
   for (int64_t i = 0; i < size; i++)
@@ -525,76 +564,25 @@ void back_chain(const Layer &layer, const Points &points, int64_t chain, const B
 }
 
 struct GramBuffers {
-  Matrix projected, weighted, sum;
+  Matrix weighted, sum;
   GramBuffers(Memory &memory, const Layer &layer, int64_t)
-      : projected(memory.matrix(POINTS, layer.num_inducing)),
-        weighted(memory.matrix(POINTS, layer.num_inducing)),
+      : weighted(memory.matrix(POINTS, layer.num_inducing)),
         sum(memory.matrix(layer.num_inducing, layer.num_inducing)) {}
 };
 
-void gram_of(int64_t size, int64_t num_points, const double *projected, const double *weights, double *out,
+void gram_of(int64_t size, int64_t num_points, Matrix projected, const double *weights, double *out,
              const GramBuffers &use) {
   clear(use.sum, padded(size));
   for (int64_t p = 0; p < num_points; p += POINTS) {
-    const int64_t count = num_points - p < POINTS ? num_points - p : POINTS, rows = padded(count);
-    read(use.projected, projected + p * size, count, size, rows);
+    const int64_t count = smaller(num_points - p, POINTS), rows = padded(count);
+    const Matrix block = {projected.row(p), projected.width};
     for (int64_t i = 0; i < rows; i++)
-      for (int64_t j = 0; j < use.weighted.width; j += LANES)
-        at(use.weighted.row(i) + j) = (i < count ? weights[p + i] : 0.0) * at(use.projected.row(i) + j);
-    add_lower(use.weighted, use.projected, rows, use.sum, size);
+      for (int64_t j = 0; j < block.width; j += LANES)
+        at(use.weighted.row(i) + j) = (i < count ? weights[p + i] : 0.0) * at(block.row(i) + j);
+    add_lower(use.weighted, block, rows, use.sum, size);
   }
   for (int64_t i = 0; i < size; i++)
     for (int64_t j = 0; j <= i; j++) out[i * size + j] = out[j * size + i] = use.sum.row(i)[j];
-}
-
-struct OwnBuffers {
-  Matrix centres, lengths, points, squares, values, slopes;
-  OwnBuffers(Memory &memory, const Layer &layer, int64_t)
-      : centres(memory.matrix(layer.input_size, layer.num_inducing)),
-        lengths(memory.matrix(1, layer.num_inducing)),
-        points(memory.matrix(layer.num_inducing, layer.input_size)),
-        squares(memory.matrix(1, layer.num_inducing)),
-        values(memory.matrix(layer.num_inducing, layer.num_inducing)),
-        slopes(memory.matrix(layer.num_inducing, layer.num_inducing)) {}
-};
-
-void own_chain(const Layer &layer, const Own &own, double *value, double *slope, const OwnBuffers &use) {
-  const int64_t size = own.size, rows = padded(size);
-  read_centres(own, use.centres, use.lengths);
-  read(use.points, own.centres, size, own.inputs, rows);
-  prepare(use.points, use.squares.values, rows, own.inputs);
-  distances(use.points, use.squares.values, rows, use.centres, use.lengths, own.inputs, use.values);
-  KERNELS::entries[layer.kernel].evaluate(use.values.values, use.slopes.values, rows * use.values.width);
-  write(value, use.values, size, size);
-  write(slope, use.slopes, size, size);
-}
-
-struct InverseBuffers {
-  Matrix factor, inverse;
-  InverseBuffers(Memory &memory, const Layer &layer, int64_t)
-      : factor(memory.matrix(layer.num_inducing, layer.num_inducing)),
-        inverse(memory.matrix(layer.num_inducing, layer.num_inducing)) {}
-};
-
-// By forward substitution: the rows of a block less what those before the block say, then one after the other.
-void invert_chain(int64_t size, const double *factor, double *inverse, const InverseBuffers &use) {
-  const int64_t all_rows = padded(size);
-  read_transposed(use.factor, factor, size, size);  // LAPACK's columns are the caller's rows
-  clear(use.inverse, all_rows);
-  for (int64_t first = 0; first < size; first += ROWS) {
-    product(use.factor.view(), use.inverse, use.inverse, first, first + ROWS,
-            [=](int64_t, int64_t j) { return Range{j, first}; });
-    for (int64_t i = first; i < first + ROWS && i < size; i++) {
-      double *row = use.inverse.row(i);
-      for (int64_t k = first; k < i; k++)
-        for (int64_t j = 0; j < first + ROWS; j += LANES)
-          at(row + j) += use.factor.row(i)[k] * at(use.inverse.row(k) + j);
-      row[i] -= 1.0;
-      const double scale = -1.0 / use.factor.row(i)[i];
-      for (int64_t j = 0; j < first + ROWS; j += LANES) at(row + j) *= scale;
-    }
-  }
-  write(inverse, use.inverse, size, size);
 }
 
 }  // namespace
@@ -608,64 +596,90 @@ int64_t kernel_number(const char *name) {
   return -1;
 }
 
-// All return 0, or 1 if there was no memory.
+// What rows and columns of large matrices are whole multiples of.
+int64_t unit() { return ROWS; }
 
-// Correlations of the inducing inputs, and their slopes: [C, M, M].
+// Correlations of the inducing inputs, and their slopes: [C, M', M']. Returns 0, or 1 if there was no memory.
 int64_t own_correlations(const Layer *layer, double *value, double *slope, int64_t first, int64_t last) {
-  const int64_t size = layer->num_inducing * layer->num_inducing;
-  return with_memory<OwnBuffers>(*layer, 0, [&](const OwnBuffers &use) {
-    for (int64_t c = first; c < last; c++) own_chain(*layer, Own(*layer, c), value + c * size, slope + c * size, use);
+  const int64_t size = layer->num_inducing;
+  return with_memory<CorrelationBuffers>(*layer, size, [&](const CorrelationBuffers &use) {
+    for (int64_t c = first; c < last; c++) {
+      const Own own(*layer, c);
+      read_centres(own, use);
+      correlate(*layer, own, own.centres, size, given(value, size, size, c), given(slope, size, size, c).values, use);
+    }
   });
 }
 
-// Inverses of lower triangular matrices, which are given by their columns: [C, M, M].
-int64_t invert(const Layer *layer, const double *factor, double *inverse, int64_t first, int64_t last) {
-  const int64_t size = layer->num_inducing * layer->num_inducing;
-  return with_memory<InverseBuffers>(*layer, 0, [&](const InverseBuffers &use) {
-    for (int64_t c = first; c < last; c++)
-      invert_chain(layer->num_inducing, factor + c * size, inverse + c * size, use);
-  });
+// Upper triangular factors of correlations + jitter: [C, M', M']. Returns how many there are not.
+int64_t factorise(const Layer *layer, const double *value, double jitter, double *upper, int64_t first, int64_t last) {
+  const int64_t size = layer->num_inducing;
+  int64_t failed = 0;
+  for (int64_t c = first; c < last; c++)
+    failed += !factorise_chain(size, given(value, size, size, c), jitter, given(upper, size, size, c));
+  return failed;
+}
+
+// Inverses of the factors, see `Layer.inverse`. Returns 0.
+int64_t invert(const Layer *layer, const double *upper, double *inverse, int64_t first, int64_t last) {
+  const int64_t size = layer->num_inducing;
+  for (int64_t c = first; c < last; c++)
+    invert_chain(size, given(upper, size, size, c), given(inverse, size, size, 2 * c),
+                 given(inverse, size, size, 2 * c + 1));
+  return 0;
 }
 
 // Points x, those of a chain `stride` numbers behind those of the one before, over the lengthscales [C, n, D]; their
-// correlations with the inducing inputs, times L^-1, [C, n, M]; and the slopes of these.
+// correlations with the inducing inputs, times L^-1, [C, n', M']; and the slopes of these. Returns 0, or 1 if there was
+// no memory.
 int64_t see(const Layer *layer, int64_t num_points, const double *x, int64_t stride, double *scaled, double *projected,
             double *slope, int64_t first, int64_t last) {
-  const int64_t row = num_points * layer->num_inducing;
+  const int64_t size = layer->num_inducing;
   return with_memory<SeeBuffers>(*layer, 0, [&](const SeeBuffers &use) {
     for (int64_t c = first; c < last; c++)
       see_chain(*layer, Own(*layer, c), x + c * stride, num_points, scaled + c * num_points * layer->input_size,
-                projected + c * row, slope + c * row, use);
+                given(projected, num_points, size, c), given(slope, num_points, size, c), use);
   });
 }
 
-// Means [C, n, O] and variances [C, n], not below `least`, from what `see` projected.
+// Means [C, n, O] and variances [C, n], not below `least`, from what `see` projected. Returns as `see` does.
 int64_t moments(const Layer *layer, int64_t outputs, const double *whitened, int64_t num_points,
                 const double *projected, double least, double *mean, double *variance, int64_t first, int64_t last) {
   const int64_t size = layer->num_inducing;
   return with_memory<MomentBuffers>(*layer, outputs, [&](const MomentBuffers &use) {
     for (int64_t c = first; c < last; c++)
       moments_chain(Own(*layer, c), outputs, whitened + c * size * outputs, num_points,
-                    projected + c * num_points * size, least, mean + c * num_points * outputs,
+                    given(projected, num_points, size, c), least, mean + c * num_points * outputs,
                     variance + c * num_points, use);
   });
 }
 
-// Gradients of what a layer was given from those of what it gave.
+// Gradients of what a layer was given from those of what it gave. Returns as `see` does.
 int64_t back(const Layer *layer, const Points *points, int64_t first, int64_t last) {
   return with_memory<BackBuffers>(*layer, points->outputs, [&](const BackBuffers &use) {
     for (int64_t c = first; c < last; c++) back_chain(*layer, *points, c, use);
   });
 }
 
-// A diag(w) A^T of each of T rows of weights [C, T, n]: [C, T, M, M].
+// A diag(w) A^T of each of T rows of weights [C, T, n]: [C, T, M, M]. Returns as `see` does.
 int64_t gram(const Layer *layer, int64_t num_points, const double *projected, int64_t num_weights,
              const double *weights, double *out, int64_t first, int64_t last) {
   const int64_t size = layer->num_inducing;
   return with_memory<GramBuffers>(*layer, 0, [&](const GramBuffers &use) {
     for (int64_t i = first * num_weights; i < last * num_weights; i++)
-      gram_of(size, num_points, projected + i / num_weights * num_points * size, weights + i * num_points,
+      gram_of(size, num_points, given(projected, num_points, size, i / num_weights), weights + i * num_points,
               out + i * size * size, use);
   });
+}
+
+// Copies the points for which `chosen` [C, n] says so: of one large matrix [C, n', M'] to another. Returns 0.
+int64_t copy(const Layer *layer, int64_t num_points, const uint8_t *chosen, const double *from, double *to,
+             int64_t first, int64_t last) {
+  const int64_t width = padded(layer->num_inducing), rows = padded(num_points);
+  for (int64_t c = first; c < last; c++)
+    for (int64_t i = 0; i < num_points; i++)
+      if (chosen[c * num_points + i])
+        for (int64_t j = (c * rows + i) * width; j < (c * rows + i + 1) * width; j += LANES) at(to + j) = at(from + j);
+  return 0;
 }
 }
