@@ -43,11 +43,15 @@ class _Points(ctypes.Structure):
         ("scaled", _Doubles),
         ("projected", _Doubles),
         ("slope", _Doubles),
+        ("mean", _Doubles),
+        ("variance", _Doubles),
         ("mean_bar", _Doubles),
         ("variance_bar", _Doubles),
         ("whitened_bar", _Doubles),
-        ("scaled_bar", _Doubles),
-        ("centres_bar", _Doubles),
+        ("points_bar", _Doubles),
+        ("inducing_bar", _Doubles),
+        ("log_lengthscale_bar", _Doubles),
+        ("log_variance_bar", _Doubles),
     )
 
 
@@ -154,26 +158,28 @@ class CompiledLayer:
         self,
         whitened: Float[Tensor, "C M O"],
         seen: tuple[Float[Tensor, "C n D"], Float[Tensor, "C M n"], Float[Tensor, "C n M"]],
-        mean_bar: Float[Tensor, "C n O"],
-        variance_bar: Float[Tensor, "C n"],
+        passed: tuple[Float[Tensor, "C n O"], Float[Tensor, "C n"]],
+        passed_bar: tuple[Float[Tensor, "C n O"], Float[Tensor, "C n"]],
         *,
         of_points: bool,
-        of_centres: bool,
-    ) -> tuple[Float[Tensor, "C M O"], Float[Tensor, "C n D"] | None, Float[Tensor, "C M D"] | None]:
-        """The fields of `layers.LayerGradients`; those of the points come with those of the centres."""
+        of_parameters: bool,
+    ) -> tuple[Float[Tensor, "C M O"], Float[Tensor, "C n D"] | None, list[Tensor] | None]:
+        """The fields of `layers.LayerGradients`, from the moments and their gradients."""
         scaled, projected, slope = seen
-        num_points, outputs = mean_bar.shape[1:]
+        num_points, outputs = passed[0].shape[1:]
         given = (
             whitened.contiguous(), scaled.contiguous(), self._in_place(projected.mT), self._in_place(slope),
-            mean_bar.contiguous(), variance_bar.contiguous(),
+            *(tensor.contiguous() for tensor in (*passed, *passed_bar)),
         )  # fmt: skip
         whitened_bar = self._new(self._size, outputs)
-        scaled_bar = self._new(num_points, self._inputs) if of_points or of_centres else None
-        centres_bar = self._new(self._size, self._inputs) if of_centres else None
-        found = whitened_bar, scaled_bar, centres_bar
-        pointers = (None if tensor is None else tensor.data_ptr() for tensor in (*given, *found))
+        points_bar = self._new(num_points, self._inputs) if of_points else None
+        shapes = ((self._size, self._inputs), (self._inputs,), ()) if of_parameters else ()
+        parameters_bar = [self._new(*shape) for shape in shapes]
+        pointers = [tensor.data_ptr() for tensor in (*given, whitened_bar)]
+        pointers.append(0 if points_bar is None else points_bar.data_ptr())
+        pointers += [tensor.data_ptr() for tensor in parameters_bar]
         self._call("back", ctypes.byref(_Points(num_points, outputs, *pointers)))
-        return found
+        return whitened_bar, points_bar, parameters_bar or None
 
     def gram(self, projected: Float[Tensor, "C M n"], weights: Float[Tensor, "C T n"]) -> Float[Tensor, "C T M M"]:
         """A diag(w) A^T for each row of weights."""

@@ -117,22 +117,13 @@ def gradients(
     parameters_bar: list[Tensor] = [noise_bar]
     through = None  # the gradient of the layer's output that comes from the layers above it, past their means
     for index in reversed(range(len(passed))):
-        layer, (seen, mean, variance) = prepared.layers[index], passed[index]
-        found = layer_gradients(
-            layer, whitened[index], seen, mean_bar, variance_bar, of_points=index > 0, of_centres=of_parameters
-        )
+        layer, wanted = prepared.layers[index], {"of_points": index > 0, "of_parameters": of_parameters}
+        found = layer_gradients(layer, whitened[index], passed[index], mean_bar, variance_bar, **wanted)
         whitened_bar.append(found.whitened)
-        if found.scaled is None:
-            break
-        if found.centres is not None:
-            centres_bar, scaled_bar = found.centres, found.scaled
-            log_lengthscale_bar = -((centres_bar * layer.centres).sum(-2) + (scaled_bar * seen.scaled).sum(-2))
-            log_variance_bar = 0.5 * (mean_bar * mean).sum((-2, -1)) + (variance_bar * variance).sum(-1)
-            parameters_bar = [centres_bar / layer.lengthscale, log_lengthscale_bar, log_variance_bar, *parameters_bar]
-        if index:
+        parameters_bar = [*(found.parameters or ()), *parameters_bar]
+        if found.points is not None:
             # Onto what the layer below gave: through this layer, and past it, whose mean function is the identity.
-            mean_bar = found.scaled / layer.lengthscale
-            through = mean_bar = mean_bar if through is None else mean_bar + through
+            through = mean_bar = found.points if through is None else found.points + through
             below = passed[index - 1].variance
             variance_bar = 0.5 * (mean_bar * latents[index - 1]).sum(-1) / below.sqrt()
     flat = torch.cat([bar.flatten(-2) for bar in reversed(whitened_bar)], dim=-1)

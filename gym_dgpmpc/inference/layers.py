@@ -56,9 +56,9 @@ class LayerGradients(NamedTuple):
     """Of what a layer was given."""
 
     whitened: Float[Tensor, "C M O"]
-    scaled: Float[Tensor, "C n D"] | None
-    """Of the points, over the lengthscales."""
-    centres: Float[Tensor, "C M D"] | None
+    points: Float[Tensor, "C n D"] | None
+    parameters: list[Tensor] | None
+    """In the order of `gp.layer.PARAMETERS`."""
 
 
 def layer_terms(layer: Layer, *, compile: bool = True) -> LayerTerms:
@@ -120,30 +120,39 @@ def choose(terms: LayerTerms, first_one: Bool[Tensor, "C n"], one: Passed, other
 def layer_gradients(
     terms: LayerTerms,
     whitened: Float[Tensor, "C M O"],
-    seen: Seen,
+    passed: Passed,
     mean_bar: Float[Tensor, "C n O"],
     variance_bar: Float[Tensor, "C n"],
     *,
     of_points: bool = True,
-    of_centres: bool = True,
+    of_parameters: bool = True,
 ) -> LayerGradients:
-    """Gradients from those of a layer's moments; of the points, and of the centres, only if they are wanted."""
+    """Gradients from those of a layer's moments; of the points, and of the parameters, only if they are wanted."""
+    seen, mean, variance = passed
     if terms.compiled is not None:
-        found = terms.compiled.back(
-            whitened, seen, mean_bar, variance_bar, of_points=of_points, of_centres=of_centres
+        return LayerGradients(
+            *terms.compiled.back(
+                whitened, seen, (mean, variance), (mean_bar, variance_bar),
+                of_points=of_points, of_parameters=of_parameters,
+            )
         )  # fmt: skip
-        return LayerGradients(*found)
     scale = terms.variance.sqrt()
     whitened_bar = scale * (seen.projected @ mean_bar)
-    if not of_points and not of_centres:
+    if not of_points and not of_parameters:
         return LayerGradients(whitened_bar, None, None)
     projected_bar = scale * (whitened @ mean_bar.mT)
     projected_bar -= 2.0 * terms.variance * seen.projected * variance_bar.unsqueeze(-2)
     by_distance = (terms.inverse.mT @ projected_bar).mT * seen.slope
     # d |x_i - z_j|^2 / d x_i = 2 (x_i - z_j), summed over the j.
     scaled_bar = 2.0 * (by_distance.sum(-1, keepdim=True) * seen.scaled - by_distance @ terms.centres)
-    centres_bar = _centres_gradient(terms, seen, by_distance, projected_bar) if of_centres else None
-    return LayerGradients(whitened_bar, scaled_bar, centres_bar)
+    points_bar = scaled_bar / terms.lengthscale if of_points else None
+    if not of_parameters:
+        return LayerGradients(whitened_bar, points_bar, None)
+    centres_bar = _centres_gradient(terms, seen, by_distance, projected_bar)
+    log_lengthscale_bar = -((centres_bar * terms.centres).sum(-2) + (scaled_bar * seen.scaled).sum(-2))
+    log_variance_bar = 0.5 * (mean_bar * mean).sum((-2, -1)) + (variance_bar * variance).sum(-1)
+    parameters_bar = [centres_bar / terms.lengthscale, log_lengthscale_bar, log_variance_bar]
+    return LayerGradients(whitened_bar, points_bar, parameters_bar)
 
 
 def _centres_gradient(

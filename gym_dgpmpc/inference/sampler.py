@@ -15,9 +15,8 @@ With ``hyperparameters="optimised"``, the default, theta follows the moving-wind
 Adam steps under positions of the latest SG-HMC steps.
 """
 
-import copy
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -25,8 +24,8 @@ from torch import Tensor
 
 from gym_dgpmpc.data.standardised import Data, DataSource
 from gym_dgpmpc.gp.deep_gp import DeepGP
-from gym_dgpmpc.inference import sghmc
-from gym_dgpmpc.inference.adam import adam_memory
+from gym_dgpmpc.inference import adam, sghmc
+from gym_dgpmpc.inference.adam import AdamState
 from gym_dgpmpc.inference.gradients import Gradients, forward, gradients, likelihood, pass_first, prepare
 from gym_dgpmpc.inference.last_layer import last_layer_evidence
 from gym_dgpmpc.inference.latents import move_latents, with_latents
@@ -105,12 +104,11 @@ class Chains:
         self._kernels, self.data, self.settings, self._num_burn_in = model, data, settings, num_burn_in
         self._settled, self.scale, self._compile = settled, scale, compile
         self.state = state
-        self._flat = state.parameters.position.clone()
-        self._optimiser = torch.optim.Adam([self._flat], lr=settings.learning_rate)
-        self._optimiser.state[self._flat] = adam_memory(self._flat)
-        self._window = self._flat.new_empty(settings.window_size, *state.whitened.position.shape)
+        self._adam = adam.init(state.parameters.position)
+        position = state.whitened.position
+        self._window = position.new_empty(settings.window_size, *position.shape)
         self.iteration = 0
-        self.value = self._flat.new_zeros(state.num_chains)
+        self.value = position.new_zeros(state.num_chains)
         """The last negative log likelihood per observation, on a minibatch, of each chain."""
         self._refactorise()
 
@@ -191,7 +189,7 @@ class Chains:
 
     def _batch(self, size: int, generator: torch.Generator) -> tuple[Data, Int[Tensor, "n"] | None]:
         """Rows of the data, drawn uniformly with replacement, and which they are; None stands for all of them."""
-        num_rows, device = self.data.num_rows, self._flat.device
+        num_rows, device = self.data.num_rows, self._window.device
         if num_rows > size:
             index = torch.randint(num_rows, (size,), generator=generator, device=device)
             return self.data.rows(index), index
@@ -270,21 +268,17 @@ class Chains:
             if sampled:  # which the preconditioner is for
                 parameters = sghmc.adapt(parameters, gradient)
             done = 1.0 if self._settled else min(self.iteration / max(self._num_burn_in, 1), 1.0)
-            self._optimiser.param_groups[0]["lr"] = self.scale * settings.learning_rate * LAST_LEARNING_RATE**done
-            self._flat.copy_(parameters.position)
-            self._flat.grad = gradient
-            self._optimiser.step()
-            parameters = parameters._replace(position=self._flat.clone())
+            rate = self.scale * settings.learning_rate * LAST_LEARNING_RATE**done
+            self._adam, position = adam.step(self._adam, parameters.position, gradient, rate)
+            parameters = parameters._replace(position=position)
         self.state = self.state._replace(parameters=parameters)
         self._refactorise()
 
     def snapshot(self) -> "Snapshot":
         """A copy of everything that `step` moves."""
         latents = [latent.clone() for latent in self.state.latents]
-        optimiser = copy.deepcopy(self._optimiser.state_dict())
-        return Snapshot(
-            self.state._replace(latents=latents), optimiser, self._window.clone(), self.iteration, self.value
-        )
+        state = self.state._replace(latents=latents)
+        return Snapshot(state, self._adam, self._window.clone(), self.iteration, self.value)
 
     def restore(self, snapshot: "Snapshot", scale: float = 1.0) -> None:
         """Go back to a snapshot, with all further steps multiplied by ``scale``, and the chains brought to rest.
@@ -295,7 +289,7 @@ class Chains:
         self.state = ChainState(
             _at_rest(state.whitened), _at_rest(state.parameters), [latent.clone() for latent in state.latents]
         )
-        self._optimiser.load_state_dict(copy.deepcopy(snapshot.optimiser))
+        self._adam = snapshot.adam
         self._window.copy_(snapshot.window)
         self.iteration, self.value = snapshot.iteration, snapshot.value
         self.scale *= scale
@@ -323,7 +317,7 @@ class Snapshot(NamedTuple):
     """See `Chains.snapshot`."""
 
     state: ChainState
-    optimiser: dict[str, Any]
+    adam: AdamState
     window: Tensor
     iteration: int
     value: Tensor

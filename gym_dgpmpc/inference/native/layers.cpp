@@ -452,11 +452,15 @@ struct Points {
   const double *scaled;        // [C, n, D]
   const double *projected;     // [C, n', M']
   const double *slope;         // [C, n', M']
+  const double *mean;          // [C, n, O]
+  const double *variance;      // [C, n]
   const double *mean_bar;      // [C, n, O]
   const double *variance_bar;  // [C, n]
   double *whitened_bar;        // [C, M, O]
-  double *scaled_bar;          // [C, n, D], or null where neither it nor centres_bar is wanted
-  double *centres_bar;         // [C, M, D], or null
+  double *points_bar;          // [C, n, D], or null
+  double *inducing_bar;        // [C, M, D], or null, and with it the next two
+  double *log_lengthscale_bar; // [C, D]
+  double *log_variance_bar;    // [C]
 };
 
 struct BackBuffers {
@@ -484,8 +488,10 @@ void read_with_ones(Matrix to, const double *from, int64_t count, int64_t size, 
   for (int64_t i = 0; i < count; i++) to.row(i)[size] = 1.0;
 }
 
-// Of the centres: through their distances to the points, and through the factor of their own correlations.
-void centres_gradient(const Own &own, const BackBuffers &use, int64_t outputs, double *centres_bar) {
+// Of the inducing inputs: through their distances to the points, and through the factor of their own correlations.
+// What is added to the gradient of the logarithms of the lengthscales is subtracted from `log_lengthscale_bar`.
+void inducing_gradient(const Own &own, const BackBuffers &use, int64_t outputs, double *inducing_bar,
+                       double *log_lengthscale_bar) {
   const int64_t size = own.size, inputs = own.inputs, rows = padded(size);
   // `lower` has A_bar A^T so far as it comes from the variances; of the means it is a product of few columns.
   add_lower(use.whitened, use.whitened_bar, outputs, use.lower, size);
@@ -508,7 +514,9 @@ void centres_gradient(const Own &own, const BackBuffers &use, int64_t outputs, d
       const double centre = own.centres[i * inputs + d];
       const double by_points = use.by_centre.row(inputs)[i] * centre - use.by_centre.row(d)[i];
       const double by_centres = use.own.row(i)[inputs] * centre - use.own.row(i)[d];
-      centres_bar[i * inputs + d] = 2.0 * by_points - 2.0 * by_centres;
+      const double bar = 2.0 * by_points - 2.0 * by_centres;
+      log_lengthscale_bar[d] -= bar * centre;
+      inducing_bar[i * inputs + d] = bar / own.lengthscale[d];
     }
 }
 
@@ -519,7 +527,9 @@ void back_chain(const Layer &layer, const Points &points, int64_t chain, const B
   const double *scaled = points.scaled + chain * num * inputs, *mean_bar = points.mean_bar + chain * num * outputs;
   const double *variance_bar = points.variance_bar + chain * num;
   const Matrix all_projected = given(points.projected, num, size, chain), slope = given(points.slope, num, size, chain);
-  const bool further = points.scaled_bar, of_centres = points.centres_bar;
+  const bool of_parameters = points.inducing_bar, further = points.points_bar || of_parameters;
+  double *log_lengthscale_bar = points.log_lengthscale_bar + (of_parameters ? chain * inputs : 0);
+  if (of_parameters) for (int64_t d = 0; d < inputs; d++) log_lengthscale_bar[d] = 0.0;
   read_transposed(use.whitened, points.whitened + chain * size * outputs, size, outputs);
   read_with_ones(use.centres, own.centres, size, inputs, padded(size));
   clear(use.whitened_bar, padded(outputs));
@@ -538,7 +548,7 @@ void back_chain(const Layer &layer, const Points &points, int64_t chain, const B
       const double weight = i < count ? -2.0 * own.variance * variance_bar[p + i] : 0.0;
       for (int64_t j = 0; j < use.bar.width; j += LANES) at(use.bar.row(i) + j) = weight * at(projected.row(i) + j);
     }
-    if (of_centres) add_lower(use.bar, projected, rows, use.lower, size);
+    if (of_parameters) add_lower(use.bar, projected, rows, use.lower, size);
     // ... and by the means; then of the correlations, and of the squared distances.
     product(use.mean_bar.view(), use.whitened, use.bar, 0, rows, [=](int64_t, int64_t) { return every(outputs); });
     product<false>(use.bar.view(), own.inverse, use.by_distance, 0, rows,
@@ -550,17 +560,23 @@ void back_chain(const Layer &layer, const Points &points, int64_t chain, const B
     for (int64_t i = 0; i < count; i++)
       for (int64_t d = 0; d < inputs; d++) {
         const int64_t n = (p + i) * inputs + d;
-        points.scaled_bar[chain * num * inputs + n] =
-            2.0 * (use.moved.row(i)[inputs] * scaled[n] - use.moved.row(i)[d]);
+        const double bar = 2.0 * (use.moved.row(i)[inputs] * scaled[n] - use.moved.row(i)[d]);
+        if (points.points_bar) points.points_bar[chain * num * inputs + n] = bar / own.lengthscale[d];
+        if (of_parameters) log_lengthscale_bar[d] -= bar * scaled[n];
       }
-    if (!of_centres) continue;
+    if (!of_parameters) continue;
     read_with_ones(use.points, scaled + p * inputs, count, inputs, rows);
     product(use.points.transposed(), use.by_distance, use.by_centre, 0, padded(inputs + 1), all_points);
   }
   double *whitened_bar = points.whitened_bar + chain * size * outputs;
   for (int64_t i = 0; i < size; i++)
     for (int64_t o = 0; o < outputs; o++) whitened_bar[i * outputs + o] = use.whitened_bar.row(o)[i];
-  if (of_centres) centres_gradient(own, use, outputs, points.centres_bar + chain * size * inputs);
+  if (!of_parameters) return;
+  inducing_gradient(own, use, outputs, points.inducing_bar + chain * size * inputs, log_lengthscale_bar);
+  double by_means = 0.0, by_variances = 0.0;
+  for (int64_t i = 0; i < num * outputs; i++) by_means += mean_bar[i] * points.mean[chain * num * outputs + i];
+  for (int64_t i = 0; i < num; i++) by_variances += variance_bar[i] * points.variance[chain * num + i];
+  points.log_variance_bar[chain] = 0.5 * by_means + by_variances;
 }
 
 struct GramBuffers {
