@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gym_dgpmpc.data.standardised import Data, DataSource
-from gym_dgpmpc.gp.deep_gp import Factorised
-from gym_dgpmpc.inference.gradients import forward, layer_terms
+from gym_dgpmpc.gp.deep_gp import DeepGP
+from gym_dgpmpc.inference.gradients import forward, prepare
 from gym_dgpmpc.inference.last_layer import LastLayerEvidence, last_layer_evidence
 from gym_dgpmpc.inference.latents import move_latents, with_latents
 
@@ -37,18 +37,18 @@ class Follower:
     """Keeps the sum over all whole blocks of rows.
 
     Args:
-        factorised: C models, which stay.
+        model: of C chains, which stays.
         inner: inducing outputs of the inner layers, which stay.
+        compile: see `gradients.prepare`.
     """
 
-    def __init__(self, factorised: Factorised, inner: Float[Tensor, "C I"]):
-        self._factorised, self._inner = factorised, inner
-        self._terms = layer_terms(factorised)
+    def __init__(self, model: DeepGP, inner: Float[Tensor, "C I"], *, compile: bool = True):
+        self._prepared, self._inner = prepare(model, compile=compile), inner
         # What the last layer is fed does not depend on where it is itself.
-        rest = inner.new_zeros(len(inner), factorised.model.num_whitened() - inner.shape[1])
-        self._whitened = factorised.model.split(torch.cat([inner, rest], dim=1))
-        chains, targets = factorised.model.log_noise.shape
-        size = factorised.model.layers[-1].inducing_inputs.shape[-2]
+        rest = inner.new_zeros(len(inner), model.num_whitened() - inner.shape[1])
+        self._whitened = model.split(torch.cat([inner, rest], dim=1))
+        chains, targets = model.log_noise.shape
+        size = model.layers[-1].inducing_inputs.shape[-2]
         self._sum = LastLayerEvidence(
             inner.new_zeros(chains, targets, size, size), inner.new_zeros(chains, targets, size)
         )
@@ -100,8 +100,8 @@ class Follower:
         generator: torch.Generator,
     ) -> None:
         """One Metropolis step of the latents of these rows, in place."""
-        whitened, present = self._factorised.model.split(position), [latent.to(position) for latent in latents]
-        _, moved = move_latents(self._factorised, self._terms, whitened, batch, present, generator)
+        whitened, present = self._prepared.model.split(position), [latent.to(position) for latent in latents]
+        _, moved = move_latents(self._prepared, whitened, batch, present, generator)
         for latent, new in zip(latents, moved, strict=True):
             latent.copy_(new)
 
@@ -111,8 +111,8 @@ class Follower:
         """Of the rows from ``first`` to ``end``."""
         batch = _part(rows, first, end)
         x = batch.x.expand(len(self._inner), -1, -1)
-        passed = forward(self._terms, self._whitened, x, [latent[:, first:end].to(x) for latent in latents])
-        return last_layer_evidence(self._factorised, self._terms[-1], passed[-1], batch.y)
+        passed = forward(self._prepared, self._whitened, x, [latent[:, first:end].to(x) for latent in latents])
+        return last_layer_evidence(self._prepared, passed[-1], batch.y)
 
 
 def _whole(num_rows: int) -> int:

@@ -14,9 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gym_dgpmpc.errors import FactorisationError
-from gym_dgpmpc.gp.deep_gp import Factorised
 from gym_dgpmpc.gp.linalg import cholesky
-from gym_dgpmpc.inference.gradients import LayerTerms, Passed
+from gym_dgpmpc.inference.gradients import Prepared
+from gym_dgpmpc.inference.layers import Passed, gram
 
 
 class LastLayerPosterior(NamedTuple):
@@ -69,18 +69,18 @@ class LastLayerEvidence(NamedTuple):
 
 
 def last_layer_evidence(
-    factorised: Factorised, terms: LayerTerms, passed: Passed, y: Float[Tensor, "n T"], weight: float = 1.0
+    prepared: Prepared, passed: Passed, y: Float[Tensor, "n T"], weight: float = 1.0
 ) -> LastLayerEvidence:
     """Bayesian linear regression on a_n = L_z^-1 k_zn whose datum n has the noise s_n = k_nn - |a_n|^2 + noise.
 
     precision = sum_n a_n a_n^T / s_n,  moment = sum_n a_n y_n / s_n, under the likelihood of `deep_gp.log_likelihood`.
 
     Args:
-        terms, passed: of the last layer.
+        passed: of the last layer.
         weight: how often each datum counts: N / n where the rows are a subset of the data.
     """
-    a = terms.variance.sqrt() * passed.seen.projected
-    noise = factorised.model.noise_variance
+    layer, noise = prepared.layers[-1], prepared.model.noise_variance
     weights = weight / (passed.variance.unsqueeze(1) + noise.unsqueeze(-1))  # "C T n"
-    weighted = a.unsqueeze(1) * weights.unsqueeze(2)
-    return LastLayerEvidence(weighted @ a.mT.unsqueeze(1), (weighted @ y.mT.unsqueeze(-1)).squeeze(-1))
+    # a_n is the projected datum times the kernel's standard deviation.
+    precision = gram(layer, passed.seen, layer.variance * weights)
+    return LastLayerEvidence(precision, layer.variance.sqrt() * ((weights * y.mT) @ passed.seen.projected.mT))

@@ -7,10 +7,7 @@ The compiled code has kernels of its own, which it is asked for by name; one tha
 
 import ctypes
 import math
-import os
-import warnings
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -19,13 +16,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from gym_dgpmpc import compiler
 from gym_dgpmpc.dynamics.coordinates import Coordinates
-from gym_dgpmpc.dynamics.deep_gp import compiler
 from gym_dgpmpc.dynamics.noise import PathNoise
 from gym_dgpmpc.gp.kernels import Kernel
 
 _Floats = ctypes.POINTER(ctypes.c_float)
 _Integers = ctypes.POINTER(ctypes.c_int64)
+
+SOURCE = "dynamics/deep_gp/native/rollout.cpp"
 
 AS_IS, SINE, COSINE, ACTION, FORWARDS, LEFTWARDS = range(6)
 
@@ -96,7 +95,7 @@ def is_available(kernel: Kernel | None = None) -> bool:
         return False
     if kernel is None or _kernel_number(kernel) is not None:
         return True
-    _warn_of_unknown_kernel(kernel.name)
+    compiler.warn_once(f"there is no kernel {kernel.name!r} in {SOURCE}")
     return False
 
 
@@ -201,8 +200,7 @@ class CompiledRollout:
         threads, points = torch.get_num_threads(), int(self._library.points())
         share = _rounded_up(-(-num_candidates // threads), points)
         ranges = [(first, min(first + share, num_candidates)) for first in range(0, num_candidates, share)]
-        failed = run(*ranges[0]) if len(ranges) == 1 else sum(_threads(threads).map(lambda r: run(*r), ranges))
-        if failed:
+        if compiler.in_threads(run, ranges):
             raise MemoryError("could not allocate the scratch space of a rollout, a few kilobytes for each thread")
         states = states if origin is None else states + origin
         return states if self._noise is None else self._noise.all_observed(states, observation)
@@ -268,7 +266,7 @@ class CompiledRollout:
 
 @cache
 def _library() -> ctypes.CDLL | None:
-    library = compiler.load("rollout")
+    library = compiler.load(SOURCE)
     if library is not None:
         library.rollout.argtypes = (ctypes.POINTER(_Task), *(ctypes.c_int64,) * 3)
         library.kernel_number.argtypes = (ctypes.c_char_p,)
@@ -282,24 +280,6 @@ def _kernel_number(kernel: Kernel) -> int | None:
     library = _library()
     number = -1 if library is None else int(library.kernel_number(kernel.name.encode()))
     return None if number < 0 else number
-
-
-@cache
-def _warn_of_unknown_kernel(name: str) -> None:
-    warnings.warn(
-        f"planning does without compiled code, several times slower, because that has no kernel {name!r}: add it to "
-        "dynamics/deep_gp/native/rollout.cpp, or pass compile=False to silence this warning",
-        stacklevel=2,
-    )
-
-
-@cache
-def _threads(num_threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(num_threads, thread_name_prefix="rollout")
-
-
-if hasattr(os, "register_at_fork"):  # a forked child inherits the pools, but none of their threads
-    os.register_at_fork(after_in_child=_threads.cache_clear)
 
 
 def _pointer(tensor: Tensor) -> "ctypes._Pointer[ctypes.c_float]":

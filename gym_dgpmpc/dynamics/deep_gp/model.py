@@ -97,8 +97,8 @@ class DeepGPDynamics(Learner[Fitted]):
             function alone.
         split_noise: where ``add_noise`` is on, tell the sensors' noise, which only blurs what is observed, from the
             process's, which adds up over a plan, as far as the data show it; otherwise all of it adds up.
-        compile: roll "pathwise" draws out in compiled code, several times faster; a C++ compiler builds it once in a
-            few seconds. PyTorch does it where there is no compiler, on a GPU, and for kernels of your own.
+        compile: train, and roll "pathwise" draws out, in compiled code, several times faster; a C++ compiler builds it
+            once in a few seconds. PyTorch does it where there is no compiler, on a GPU, and for kernels of your own.
         dtype: precision of rollouts; training and every factorisation are in float64.
         device: where tensors live.
         **inference: the settings of `InferenceSettings`, each as a keyword argument of its own.
@@ -178,7 +178,7 @@ class DeepGPDynamics(Learner[Fitted]):
         self.resample_samples = min(resample_samples, self._samples_of_chain)
         self.inference = InferenceSettings(**inference)
         self._follower: Follower | None = None  # of what was fitted, once it is followed
-        self.compile = compile and dtype == torch.float32 and self.device.type == "cpu"
+        self.compile = compile
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """Train all chains on all transitions, then take a fresh pool of posterior samples from them.
@@ -211,6 +211,7 @@ class DeepGPDynamics(Learner[Fitted]):
             generator,
             self.inference,
             settled=settled,
+            compile=self.compile,
             on_look=lambda done, loss: report(done, total, loss),
         )
         sampled = training.sample_pool(
@@ -223,6 +224,7 @@ class DeepGPDynamics(Learner[Fitted]):
             self.inference,
             trained.scale,
             lambda count: report(iterations + count * spacing, total, trained.negative_log_likelihood),
+            compile=self.compile,
         )
         factorised = factorise_all(trained.model)
         variance = factorised.model.noise_variance.mean(0)
@@ -252,7 +254,7 @@ class DeepGPDynamics(Learner[Fitted]):
             return {}
         position, inner = fitted.chain.position, fitted.factorised.model.num_inner()
         if self._follower is None:
-            self._follower = Follower(fitted.factorised, position[:, :inner])
+            self._follower = Follower(fitted.factorised.model, position[:, :inner], compile=self.compile)
         standardised = _Standardised(self._encode, data, fitted.normalisers)
         count = self._samples_of_chain
         try:
@@ -286,7 +288,8 @@ class DeepGPDynamics(Learner[Fitted]):
         if self.draw_kind == "pathwise":
             settings = posterior, coordinates, horizon, self.num_features, self.refresh
             noise = None if process_std is None else (process_std, blur)
-            if self.compile and compiled_rollout.is_available(self.kernel):
+            single = self.dtype == torch.float32 and self.device.type == "cpu"
+            if self.compile and single and compiled_rollout.is_available(self.kernel):
                 return CompiledPathwiseSampler(*settings, generator, noise)
             return PathwiseSampler(*settings, self.dtype, generator, noise)
         joint = self.draw_kind == "joint"

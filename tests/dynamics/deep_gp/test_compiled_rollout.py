@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from gym_dgpmpc import compiler
 from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.bounds import SeenTargets
@@ -225,7 +226,7 @@ class Own(RBF):
 def test_a_kernel_that_the_compiled_code_does_not_have_is_left_to_pytorch(monkeypatch):
     """With one warning, and none where compiled code is not wanted; the plans are the same."""
     monkeypatch.setitem(KERNELS, "own", Own())
-    compiled_rollout._warn_of_unknown_kernel.cache_clear()
+    compiler.warn_once.cache_clear()
     observation = normal(seeded(), 10, 3).float()
     worlds = []
     for kernel, compile in (("own", True), ("rbf", False), ("own", False), ("own", True)):
