@@ -191,8 +191,9 @@ def test_what_the_compiled_code_does_not_have_is_left_to_pytorch():
             assert layer_terms(layer, compile=compile).compiled is None
         said.append([str(warning.message) for warning in caught])
     assert said[0] == said[2] == [] and len(said[1]) == 1 and "kernel 'own'" in said[1][0]
-    single = Layer(RBF(), *(tensor.float() for tensor in layer[1:]))
+    single = Layer(RBF(), *(tensor.float() for tensor in layer.parameters().values()))
     assert layer_terms(single).compiled is None
+    assert layer_terms(layer._replace(kernel=RBF(), log_slope=layer.log_lengthscale)).compiled is None
 
 
 @needs_compiler
