@@ -13,11 +13,11 @@ import torch
 from gymnasium import spaces
 
 from gym_dgpmpc.agents.signature import PLAIN
-from gym_dgpmpc.planning.registry import is_ready_made, make_planner, planner_factory
+from gym_dgpmpc.planning.registry import PlannerName, is_ready_made, make_planner, planner_factory
 from gym_dgpmpc.settings import Setting, joined, refuse_unknown, settings_of
 from gym_dgpmpc.types import DynamicsFactory, DynamicsModel, ObservationSpec, Planner, PlannerFactory
 
-AnyPlanner = str | PlannerFactory | Planner
+AnyPlanner = PlannerName | str | PlannerFactory | Planner
 """A planner by name, by what makes it, or ready-made."""
 
 

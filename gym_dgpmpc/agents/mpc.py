@@ -68,7 +68,6 @@ from gym_dgpmpc.types import (
     DynamicsModel,
     ObservationSpec,
     Planner,
-    PlannerFactory,
     RewardFn,
     StateDict,
     Stateful,
@@ -102,9 +101,9 @@ class MPCAgent(BaseAlgorithm):
         env: the environment, its id, or a VecEnv; actions a bounded Box, observations a vector or a Dict of vectors.
         dynamics: the model to learn; or a function (observation size, action size, `ObservationSpec`) -> model, which
             is needed if the model has to predict reward or termination too, and may be called again when that is found.
-        planner: the optimiser of action sequences: a name ("cem", or what `register_planner` added), a class or
-            function that makes one, or a ready-made planner. Its settings are further arguments of the agent, except of
-            a ready-made one.
+        planner: the optimiser of action sequences: a name ("cem", "icem", "mppi", or what `register_planner` added), a
+            class or function that makes one, or a ready-made planner. Its settings are further arguments of the agent,
+            except of a ready-made one.
         reward_fn: r(s, a, s'), batched over leading dimensions, in torch. None: the environment's ``reward_fn`` or
             `compute_reward`, or what is known of Gymnasium's own; if there is none, or with "learned", the model
             predicts it.
@@ -169,7 +168,7 @@ class MPCAgent(BaseAlgorithm):
         policy: str | type[BasePolicy] = "MPCPolicy",
         env: GymEnv | str | None = UNSET,
         dynamics: DynamicsModel | DynamicsFactory | None = None,
-        planner: str | PlannerFactory | Planner | None = None,
+        planner: AnyPlanner | None = None,
         reward_fn: RewardFn | Learned | None = None,
         terminated_fn: TerminatedFn | Learned | Never | None = None,
         observation_spec: ObservationSpec | None = None,
