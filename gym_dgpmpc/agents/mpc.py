@@ -31,6 +31,7 @@ from gym_dgpmpc.agents.composition import (
     AnyPlanner,
     Composition,
     MadeOf,
+    OfController,
     PlanningArguments,
     own_settings,
     part_settings,
@@ -53,6 +54,7 @@ from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.plan_state import PackedPlans
 from gym_dgpmpc.planning.registry import planner_factory
+from gym_dgpmpc.planning.risk import RiskMeasure, RiskName
 from gym_dgpmpc.randomness import Generators, fresh_seed, split_seed
 from gym_dgpmpc.settings import Setting, joined, settings_of
 from gym_dgpmpc.tasks.borders import received_batch
@@ -88,7 +90,7 @@ class MPCAgent(BaseAlgorithm):
 
     The first steps are uniformly random. From then on the model is trained at each episode's start, and every action
     comes from a plan: P worlds are drawn from the model, and the planner searches the H actions with the highest
-    return, averaged over the worlds.
+    return, averaged over the worlds or measured with more or less caution (``risk``).
 
     `predict` carries the plan in SB3's recurrent state, as a warm start for the next step: pass on the state that it
     returns (`evaluate_policy` does). Without it every step is planned from scratch, which costs return.
@@ -114,6 +116,11 @@ class MPCAgent(BaseAlgorithm):
             known. For Dict observations it indexes the vector of the parts in alphabetical order.
         num_particles: worlds drawn for each plan, P, over which a return is averaged.
         actions_per_plan: actions performed of each plan before the next one is made.
+        risk: what a sequence is worth whose return is not the same in all worlds: the "mean" over them; the mean less
+            ``risk_aversion`` standard deviations ("mean-std"); the mean of the worst ``cvar_share`` of them ("cvar");
+            the "worst"; or, with optimism, the "best". A world that is not finite makes a sequence lose in any case.
+        risk_aversion: standard deviations for "mean-std"; less than zero it is optimism.
+        cvar_share: share of the worlds for "cvar", in (0, 1].
         learning_starts: transitions before the first training, of random actions if they were not logged; default:
             those of one episode in each environment (as many in all, if none is let end), or ``train_freq`` if these
             come first.
@@ -174,6 +181,9 @@ class MPCAgent(BaseAlgorithm):
         observation_spec: ObservationSpec | None = None,
         num_particles: int = 5,
         actions_per_plan: int = 1,
+        risk: RiskName = "mean",
+        risk_aversion: float = 1.0,
+        cvar_share: float = 0.2,
         learning_starts: int | None = None,
         train_freq: int | None = None,
         time_budget: float | None = None,
@@ -207,7 +217,8 @@ class MPCAgent(BaseAlgorithm):
         self.verbose = verbose
         self.learning_starts, self.train_freq = learning_starts, train_freq
         self._task_given = TaskArguments(reward_fn, terminated_fn, observation_spec)
-        self._planning_given = PlanningArguments(num_particles, actions_per_plan, time_budget)
+        measure = RiskMeasure(risk, risk_aversion, cvar_share)
+        self._planning_given = PlanningArguments(num_particles, actions_per_plan, time_budget, measure)
         self.seeds_environment = seed is not None
         self.seed = fresh_seed() if seed is None else seed
         if _init_setup_model:
@@ -293,7 +304,7 @@ class MPCAgent(BaseAlgorithm):
         self.task.model(reward=reward, terminated=terminated)
         self.controller.dynamics, self.num_fitted = self._new_dynamics(), 0
 
-    # Each has one owner; these are their names on the agent.
+    # Each has one owner; these are their names on the agent. Those of the controller may be set.
 
     @property
     def dynamics(self) -> DynamicsModel:
@@ -305,32 +316,12 @@ class MPCAgent(BaseAlgorithm):
         """The optimiser of action sequences."""
         return self.controller.planner
 
-    @property
-    def num_particles(self) -> int:
-        """P, worlds drawn for each plan; may be set."""
-        return self.controller.num_particles
-
-    @num_particles.setter
-    def num_particles(self, num_particles: int) -> None:
-        self.controller.num_particles = num_particles
-
-    @property
-    def actions_per_plan(self) -> int:
-        """Actions performed of each plan; may be set."""
-        return self.controller.actions_per_plan
-
-    @actions_per_plan.setter
-    def actions_per_plan(self, actions_per_plan: int) -> None:
-        self.controller.actions_per_plan = actions_per_plan
-
-    @property
-    def time_budget(self) -> float | None:
-        """Seconds that a plan may take, or None; may be set."""
-        return self.controller.time_budget
-
-    @time_budget.setter
-    def time_budget(self, time_budget: float | None) -> None:
-        self.controller.time_budget = time_budget
+    num_particles = OfController[int]()
+    actions_per_plan = OfController[int]()
+    risk = OfController[RiskName]()
+    risk_aversion = OfController[float]()
+    cvar_share = OfController[float]()
+    time_budget = OfController["float | None"]()
 
     @property
     def observation_spec(self) -> ObservationSpec:

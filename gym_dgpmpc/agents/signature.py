@@ -17,6 +17,9 @@ from gym_dgpmpc.settings import Setting, Settings, argument_texts, joined
 PLAIN = (
     "num_particles",
     "actions_per_plan",
+    "risk",
+    "risk_aversion",
+    "cvar_share",
     "learning_starts",
     "train_freq",
     "observation_spec",
