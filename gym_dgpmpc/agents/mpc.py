@@ -38,6 +38,7 @@ from gym_dgpmpc.agents.composition import (
     setting_property,
 )
 from gym_dgpmpc.agents.episode import EpisodeRecord
+from gym_dgpmpc.agents.exploration import ExplorationName, Explorer, FirstController
 from gym_dgpmpc.agents.logs import Logs
 from gym_dgpmpc.agents.policy import MPCPolicy
 from gym_dgpmpc.agents.progress import Progress, RandomStreams
@@ -88,9 +89,9 @@ MANY_GIVEN_UP = 10
 class MPCAgent(BaseAlgorithm):
     """Learns a dynamics model from its own experience and acts by planning through it.
 
-    The first steps are uniformly random. From then on the model is trained at each episode's start, and every action
-    comes from a plan: P worlds are drawn from the model, and the planner searches the H actions with the highest
-    return, averaged over the worlds or measured with more or less caution (``risk``).
+    The first steps are random, or another controller's. From then on the model is trained at each episode's start, and
+    every action comes from a plan: P worlds are drawn from the model, and the planner searches the H actions with the
+    highest return, averaged over the worlds or measured with more or less caution (``risk``).
 
     `predict` carries the plan in SB3's recurrent state, as a warm start for the next step: pass on the state that it
     returns (`evaluate_policy` does). Without it every step is planned from scratch, which costs return.
@@ -124,6 +125,14 @@ class MPCAgent(BaseAlgorithm):
         learning_starts: transitions before the first training, of random actions if they were not logged; default:
             those of one episode in each environment (as many in all, if none is let end), or ``train_freq`` if these
             come first.
+        exploration: the random actions until then: "uniform", of each step by itself; "held", each for
+            ``exploration_hold`` steps; "coloured", uniform at each step and correlated over the steps; or "chirp", a
+            sweep from one cycle in all of these steps to one in four steps, over the whole range.
+        exploration_hold: steps for which a "held" action is performed.
+        exploration_beta: colour of "coloured" actions, whose power falls with the frequency f about as f^-beta: 1 is
+            pink, 2 red, and 0 is "uniform".
+        first_controller: in place of random actions: a function of the environment's observation, one of an environment
+            at a time, that returns an action. Beyond the bounds it is clipped. No file holds it.
         train_freq: environment steps between two trainings, for tasks that never end or whose episodes are very long
             or very short; default: one at every episode's start.
         time_budget: seconds that a plan may take, drawing its worlds included; the best plan found by then is used.
@@ -185,6 +194,10 @@ class MPCAgent(BaseAlgorithm):
         risk_aversion: float = 1.0,
         cvar_share: float = 0.2,
         learning_starts: int | None = None,
+        exploration: ExplorationName = "uniform",
+        exploration_hold: int = 5,
+        exploration_beta: float = 1.0,
+        first_controller: FirstController | None = None,
         train_freq: int | None = None,
         time_budget: float | None = None,
         stats_window_size: int = 100,
@@ -216,6 +229,8 @@ class MPCAgent(BaseAlgorithm):
         )
         self.verbose = verbose
         self.learning_starts, self.train_freq = learning_starts, train_freq
+        self.exploration, self.first_controller = exploration, first_controller
+        self.exploration_hold, self.exploration_beta = exploration_hold, exploration_beta
         self._task_given = TaskArguments(reward_fn, terminated_fn, observation_spec)
         measure = RiskMeasure(risk, risk_aversion, cvar_share)
         self._planning_given = PlanningArguments(num_particles, actions_per_plan, time_budget, measure)
@@ -270,6 +285,7 @@ class MPCAgent(BaseAlgorithm):
             self._new_dynamics(), planner, self.action_space, *self._planning_given, device=self.device
         )
         self.collector = Collector(self.store, self.n_envs, self.controller)
+        self.explorer = Explorer(self)
         self.logs = Logs(self)
         self.policy = MPCPolicy(self.observation_space, self.action_space, self)
         self._training_context: Callable[[], AbstractContextManager[None]] = nullcontext
@@ -606,8 +622,7 @@ class MPCAgent(BaseAlgorithm):
             observations = self._observations
             if self.is_exploring:
                 self._warn_of_an_endless_beginning()
-                exploration = self.generators.exploration
-                actions = np.stack([self.controller.uniform(exploration) for _ in range(self.n_envs)])
+                actions = self.explorer.actions(observations)
             else:
                 actions = self._plan(observations)
 

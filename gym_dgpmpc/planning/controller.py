@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from gymnasium import spaces
+from jaxtyping import Float
 
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import PlanningError
@@ -204,8 +205,11 @@ class Controller:
 
     def uniform(self, generator: torch.Generator) -> np.ndarray:
         """A uniformly random action, [A]."""
-        uniform = torch.rand(self._low.shape, generator=generator, dtype=torch.float32, device=self.device)
-        return (self._low + (self._high - self._low) * uniform).cpu().numpy()
+        return self.within(torch.rand(self._low.shape, generator=generator, dtype=torch.float32, device=self.device))
+
+    def within(self, share: Float[torch.Tensor, " A"]) -> np.ndarray:
+        """The action that lies at these shares of the range, from 0, the lower bounds, to 1, [A]."""
+        return (self._low + (self._high - self._low) * share).clamp(self._low, self._high).cpu().numpy()
 
     def _check_planned(self, plan: Plan) -> None:
         """Raise PlanningError unless a plan can be performed, carried on and saved.

@@ -24,7 +24,17 @@ from tests.checkpoints.common import changed, load
 from tests.planning.toy_planners import RandomShooting
 
 NAMED = (DGPMPCAgent, GPMPCAgent, PETSAgent)
-NOT_SAVED = {"policy", "env", "reward_fn", "terminated_fn", "device", "compile", "dynamics", "settings"}
+NOT_SAVED = {
+    "policy",
+    "env",
+    "reward_fn",
+    "terminated_fn",
+    "first_controller",
+    "device",
+    "compile",
+    "dynamics",
+    "settings",
+}
 
 
 @pytest.fixture
