@@ -67,8 +67,9 @@ class ICEM:
             at least one.
         num_iterations: iterations of a plan, at most.
         smoothing: weight of the old mean and variance in the new ones, in [0, 1).
-        noise_beta: colour of the candidates' noise, whose power falls with the frequency f as f^-beta: 0 is white, 2
-            red. The authors take 0.25 for the half-cheetah, and 2 to 3.5 where a movement takes the whole horizon.
+        noise_beta: colour of the candidates' noise, whose power falls with the frequency f as f^-beta: 0 is white, 1
+            pink, 2 red. The authors take 0.25 for the half-cheetah, and 2 to 3.5 where a movement takes the whole
+            horizon.
         fraction_elites_reused: share of the elites that are kept, in [0, 1].
         factor_decrease_num: by how much the population shrinks from iteration to iteration, at least 1.
         start_std: standard deviation that each plan starts with, as a fraction of the action's range.
@@ -90,7 +91,7 @@ class ICEM:
         num_elites: int | None = None,
         num_iterations: int = 5,
         smoothing: float = 0.1,
-        noise_beta: float = 1.0,
+        noise_beta: float = 0.25,
         fraction_elites_reused: float = 0.3,
         factor_decrease_num: float = 1.25,
         start_std: float = 0.25,
