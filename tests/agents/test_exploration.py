@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from gym_dgpmpc.agents.exploration import ExplorationName, chirp_shares, coloured_shares
 from gym_dgpmpc.errors import CheckpointError
+from gym_dgpmpc.randomness import episode_generator
 from tests.agents.point_mass import LENGTH, KnownPointMass, actions_of, agent
 from tests.checkpoints.common import load
 from tests.checkpoints.test_resume import train
@@ -106,6 +107,18 @@ def test_a_sweep_passes_all_frequencies_with_every_number():
     assert len(crossings) == pytest.approx(2 * cycles, abs=2)
     assert (np.abs(np.corrcoef(wave.T)[np.triu_indices(3, 1)]) < 0.15).all()
     assert not np.allclose(wave, 2 * chirp_shares(length, 3, seeded(1), CPU).numpy() - 1, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "length"), [({"learning_starts": 12}, 6), ({"train_freq": 8}, 4), ({"learning_starts": 60}, LENGTH)]
+)
+def test_a_sweep_is_over_the_steps_that_exploration_takes(settings, length):
+    """Of each of two environments, or over an episode if that is shorter."""
+    env = DummyVecEnv([lambda: TimeLimit(KnownPointMass(), LENGTH)] * 2)
+    learner = agent(env, exploration="chirp", **settings).learn(2 * length)
+    for index, each in enumerate(learner.env.envs):
+        shares = chirp_shares(length, 1, episode_generator(0, index, 0), CPU).numpy()
+        np.testing.assert_allclose(actions_of(each)[:length], -2 + 4 * shares, atol=1e-6)
 
 
 @pytest.mark.parametrize("length", [1, 2, 5])

@@ -94,7 +94,8 @@ def test_elites_live_on_in_the_next_plan():
     assert (warm.num_kept, warm.num_open) == (3, 2)
     assert torch.equal(warm.mean[2:], plan.mean[-1:].expand(2, -1))
     objective, seen = watched()
-    planner.plan(objective, warm, seeded(1))
+    after, _ = planner.plan(objective, warm, seeded(1))
+    assert after.num_open == 0
     joined = seen[0][-3:]
     assert len(seen[0]) == 64 + 3
     assert torch.equal(joined[:, :2], plan.elites[:, 2:])
