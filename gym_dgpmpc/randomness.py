@@ -17,7 +17,7 @@ class Generators(NamedTuple):
     """An agent's generators, one per use."""
 
     exploration: torch.Generator
-    """The uniform actions before there is a model."""
+    """The uniform actions before there is a model; other random ones have an `episode_generator`."""
     fit: torch.Generator
     """Training and re-sampling of the dynamics model."""
     planning: torch.Generator
@@ -62,6 +62,11 @@ def observation_generator(seed: int, observation: np.ndarray, device: torch.devi
     digest = hashlib.blake2b(np.ascontiguousarray(observation).tobytes(), digest_size=4).digest()
     key = int.from_bytes(digest, "little")
     return torch.Generator(device).manual_seed(derive_seed(seed, "deterministic_prediction", key))
+
+
+def episode_generator(seed: int, episode: int, part: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """A generator for the actions of a part of a random episode, by the numbers of episode and part alone."""
+    return torch.Generator(device).manual_seed(derive_seed(seed, "exploration", episode, part))
 
 
 def fresh_seed() -> int:
