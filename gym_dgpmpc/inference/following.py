@@ -82,7 +82,7 @@ class Follower:
         evidence = total
         if whole < data.num_rows:
             evidence = total.plus(self._evidence(data, grown, whole, data.num_rows))
-        positions = evidence.posterior().positions(self._inner, num_samples, generator)
+        positions = evidence.posterior(self._prepared.factorise).positions(self._inner, num_samples, generator)
         self._sum, self._num_summed = total, whole
         return Followed(positions, grown)
 

@@ -73,7 +73,7 @@ def layer_terms(layer: Layer, *, compile: bool = True) -> LayerTerms:
     if compile and compiled_layers.can_take(layer.kernel, centres):
         compiled = CompiledLayer(layer.kernel, lengthscale, variance, centres)
         correlations, own_slope = compiled.own_correlations()
-        factor = cholesky(correlations, factorise=compiled.factorise)
+        factor = cholesky(correlations, factorise=compiled_layers.factorise)
         inverse = compiled.invert(factor)
     else:
         correlations, own_slope = layer.kernel.correlation_and_slope(sqdist(centres, centres))

@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from gym_dgpmpc import compiler
+from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.kernels import KERNELS, RBF
 from gym_dgpmpc.gp.layer import PARAMETERS, Layer
+from gym_dgpmpc.gp.linalg import cholesky
 from gym_dgpmpc.inference import compiled_layers, layers
 from gym_dgpmpc.inference.layers import Seen, gram, layer_gradients, layer_terms, moments, see
 from tests.oracles.models import normal, seeded
@@ -73,6 +75,34 @@ def test_compiled_layers_are_pytorchs(kernel, sizes):
         allowed = AS_FAR * rounding + 16 * 2**-53 * largest * cancelling.get(name, 1.0)
         assert allowed <= 1e-8 * largest, name
         assert float((found[name] - value).abs().max()) <= allowed, name
+
+
+@needs_compiler
+@pytest.mark.parametrize("size", [1, 7, 8, 33, 104])
+def test_compiled_factors_are_lapacks(size):
+    """Of matrices in any memory; to the rounding of a Cholesky factorisation, M eps times the matrix (Higham 2002)."""
+    root = normal(seeded(), 3, 2, size, size)
+    matrices = root @ root.mT
+    strided = torch.nn.functional.pad(matrices, (0, 5))[..., :size]
+    for given, added in ((matrices, 0.1), (strided, 0.1), (matrices.mT, 2.0)):
+        factor, exists = compiled_layers.factorise(given, added)
+        assert exists and factor.shape == matrices.shape
+        assert not factor.triu(1).any() and (factor.diagonal(dim1=-2, dim2=-1) > 0).all()
+        rounding = (size + 1) * 2**-52 * float(matrices.diagonal(dim1=-2, dim2=-1).max() + added)
+        expected = matrices + added * torch.eye(size).double()
+        torch.testing.assert_close(factor @ factor.mT, expected, rtol=0, atol=rounding)
+
+
+@needs_compiler
+@pytest.mark.parametrize("value", [-1e-3, math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("place", [0, 6, 19])
+def test_a_matrix_that_has_no_factor_is_told(place, value):
+    matrices = torch.eye(20).double().repeat(4, 1, 1)
+    assert compiled_layers.factorise(matrices, 0.0)[1]
+    matrices[2, place, place] = value
+    assert not compiled_layers.factorise(matrices, 0.0)[1]
+    with pytest.raises(FactorisationError, match="jitter" if value == -1e-3 else "finite"):
+        cholesky(matrices, jitter=1e-8, factorise=compiled_layers.factorise)
 
 
 @needs_compiler

@@ -339,13 +339,13 @@ void correlate(const Layer &layer, const Own &own, const double *scaled, int64_t
 
 // Upper triangular U = L^T with U^T U = m + jitter, row by row of blocks: what the rows above say of a block of rows,
 // then these one after the other. Returns whether it exists.
-bool factorise_chain(int64_t size, Matrix m, double jitter, Matrix upper) {
+bool factorise_one(int64_t size, const double *m, int64_t row_of_m, double jitter, Matrix upper) {
   clear(upper, padded(size));
   bool exists = true;
   for (int64_t first = 0; first < size; first += ROWS) {
     const int64_t end = smaller(first + ROWS, size);
     for (int64_t i = first; i < end; i++) {
-      for (int64_t j = i; j < size; j++) upper.row(i)[j] = -m.row(i)[j];
+      for (int64_t j = i; j < size; j++) upper.row(i)[j] = -m[i * row_of_m + j];
       upper.row(i)[i] -= jitter;
     }
     product(upper.transposed(), upper, upper, first, first + ROWS,
@@ -627,12 +627,13 @@ int64_t own_correlations(const Layer *layer, double *value, double *slope, int64
   });
 }
 
-// Upper triangular factors of correlations + jitter: [C, M', M']. Returns how many there are not.
-int64_t factorise(const Layer *layer, const double *value, double jitter, double *upper, int64_t first, int64_t last) {
-  const int64_t size = layer->num_inducing;
+// Upper triangular factors [n, M', M'] of n matrices of M rows + jitter, whose rows and matrices have these strides.
+// Returns how many do not exist.
+int64_t factorise(int64_t size, const double *matrices, int64_t stride, int64_t row, double jitter, double *upper,
+                  int64_t first, int64_t last) {
   int64_t failed = 0;
-  for (int64_t c = first; c < last; c++)
-    failed += !factorise_chain(size, given(value, size, size, c), jitter, given(upper, size, size, c));
+  for (int64_t i = first; i < last; i++)
+    failed += !factorise_one(size, matrices + i * stride, row, jitter, given(upper, size, size, i));
   return failed;
 }
 
