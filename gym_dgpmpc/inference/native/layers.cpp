@@ -51,6 +51,8 @@ namespace {
 
 inline vec all(double value) { return vec{} + value; }
 inline int64_t rounded_up(int64_t size, int64_t unit) { return (size + unit - 1) / unit * unit; }
+inline int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
+inline int64_t larger(int64_t a, int64_t b) { return a > b ? a : b; }
 inline int64_t padded(int64_t size) { return rounded_up(size, ROWS); }
 inline vec &at(double *values) { return *(vec *)values; }
 inline const vec &at(const double *values) { return *(const vec *)values; }
@@ -182,17 +184,40 @@ struct Matrix {
   View transposed() const { return {values, 1, width}; }
 };
 
-// c += a b, or c = a b if not ADD, over k = begin..end-1, for ROWS rows and some vectors of columns, which stay in
-// registers.
+struct Range {
+  int64_t begin, end;
+};
+
+// c += a b, or c = a b if not ADD, for ROWS rows and some vectors of columns, which stay in registers. Each vector has
+// the k of its own that count; they share those from the latest beginning to the earliest end.
 template <bool ADD, int COUNT>
-inline void tile(View a, Matrix b, Matrix c, int64_t i, int64_t j, int64_t begin, int64_t end) {
+inline void tile(View a, Matrix b, Matrix c, int64_t i, int64_t j, const Range *ranges) {
   vec sum[ROWS][COUNT];
 #pragma GCC unroll 8
   for (int r = 0; r < ROWS; r++)
 #pragma GCC unroll 3
     for (int v = 0; v < COUNT; v++) sum[r][v] = ADD ? at(c.row(i + r) + j + v * LANES) : vec{};
-  const double *left = a.values + i * a.row + begin * a.column;
-  for (int64_t k = begin; k < end; k++, left += a.column) {
+  Range shared = ranges[0];
+#pragma GCC unroll 3
+  for (int v = 1; v < COUNT; v++)
+    shared = {larger(shared.begin, ranges[v].begin), smaller(shared.end, ranges[v].end)};
+  if (shared.end < shared.begin) shared.end = shared.begin;
+#pragma GCC unroll 3
+  for (int v = 0; v < COUNT; v++) {
+    const Range range = ranges[v];
+    const Range parts[2] = {{range.begin, smaller(shared.begin, range.end)}, {larger(shared.end, range.begin), range.end}};
+#pragma GCC unroll 2
+    for (const Range part : parts) {
+      const double *left = a.values + i * a.row + part.begin * a.column;
+      for (int64_t k = part.begin; k < part.end; k++, left += a.column) {
+        const vec right = at(b.row(k) + j + v * LANES);
+#pragma GCC unroll 8
+        for (int r = 0; r < ROWS; r++) sum[r][v] += left[r * a.row] * right;
+      }
+    }
+  }
+  const double *left = a.values + i * a.row + shared.begin * a.column;
+  for (int64_t k = shared.begin; k < shared.end; k++, left += a.column) {
     vec right[COUNT];
 #pragma GCC unroll 3
     for (int v = 0; v < COUNT; v++) right[v] = at(b.row(k) + j + v * LANES);
@@ -207,31 +232,28 @@ inline void tile(View a, Matrix b, Matrix c, int64_t i, int64_t j, int64_t begin
     for (int v = 0; v < COUNT; v++) at(c.row(i + r) + j + v * LANES) = sum[r][v];
 }
 
-struct Range {
-  int64_t begin, end;
-};
-
-// The product for rows first..last-1 and all columns of c; `ranges(i, j)` says which k count for the rows from i and
-// the columns from j on, where j is the first and `j + VECTORS * LANES` beyond the last of a block. Where none do c
-// stays. Columns are outside: theirs of b stay in the nearest cache.
+// The product for rows first..last-1 and all columns of c; `ranges(i, j)` says which k count for ROWS rows from i and a
+// vector of columns from j on. Columns are outside: theirs of b stay in the nearest cache.
 template <bool ADD = true, class Ranges>
 void product(View a, Matrix b, Matrix c, int64_t first, int64_t last, Ranges ranges) {
   for (int64_t j = 0; j < c.width; j += VECTORS * LANES)
     for (int64_t i = first; i < last; i += ROWS) {
-      const Range range = ranges(i, j);
-      if (range.begin >= range.end) continue;
-      if (c.width - j >= VECTORS * LANES)
-        tile<ADD, VECTORS>(a, b, c, i, j, range.begin, range.end);
-      else if (c.width - j >= 2 * LANES)
-        tile<ADD, 2>(a, b, c, i, j, range.begin, range.end);
-      else
-        tile<ADD, 1>(a, b, c, i, j, range.begin, range.end);
+      Range each[VECTORS];
+      int count = 0;  // without the last vectors for which no k counts
+      for (int v = 0; v < VECTORS && j + v * LANES < c.width; v++) {
+        each[v] = ranges(i, j + v * LANES);
+        if (each[v].begin < each[v].end) count = v + 1;
+      }
+      if (count == 3)
+        tile<ADD, 3>(a, b, c, i, j, each);
+      else if (count == 2)
+        tile<ADD, 2>(a, b, c, i, j, each);
+      else if (count == 1)
+        tile<ADD, 1>(a, b, c, i, j, each);
     }
 }
 
 inline Range every(int64_t count) { return {0, count}; }
-inline int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
-inline int64_t larger(int64_t a, int64_t b) { return a > b ? a : b; }
 
 // One of the caller's large matrices, of which there are some one after the other.
 inline Matrix given(const double *values, int64_t rows, int64_t columns, int64_t index) {
@@ -349,7 +371,7 @@ bool factorise_one(int64_t size, const double *m, int64_t row_of_m, double jitte
       upper.row(i)[i] -= jitter;
     }
     product(upper.transposed(), upper, upper, first, first + ROWS,
-            [=](int64_t, int64_t j) { return j + VECTORS * LANES > first ? every(first) : Range{0, 0}; });
+            [=](int64_t, int64_t j) { return j + LANES > first ? every(first) : Range{0, 0}; });
     for (int64_t i = first; i < end; i++) {
       double *row = upper.row(i);
       for (int64_t k = first; k < i; k++)
@@ -407,7 +429,7 @@ void see_chain(const Layer &layer, const Own &own, const double *x, int64_t num_
     const int64_t count = smaller(num_points - p, POINTS);
     correlate(layer, own, scaled + p * inputs, count, use.values, slope.row(p), use.correlations);
     product<false>(use.values.view(), own.transposed, {projected.row(p), projected.width}, 0, padded(count),
-                   [=](int64_t, int64_t j) { return every(smaller(j + VECTORS * LANES, size)); });
+                   [=](int64_t, int64_t j) { return every(smaller(j + LANES, size)); });
   }
 }
 
