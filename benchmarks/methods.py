@@ -31,6 +31,7 @@ NO_SETTINGS = {
     "tensorboard_log",
     "stats_window_size",
     "device",
+    "first_controller",
     "_init_setup_model",
 }
 """Arguments that do not influence what is learned, or that the runner sets itself."""

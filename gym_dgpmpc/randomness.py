@@ -19,7 +19,7 @@ class Generators(NamedTuple):
     """An agent's generators, one per use."""
 
     exploration: torch.Generator
-    """The uniform actions before there is a model."""
+    """The uniform actions before there is a model; other random ones have an `episode_generator`."""
     fit: torch.Generator
     """Training and re-sampling of the dynamics model."""
     planning: torch.Generator
@@ -73,6 +73,11 @@ def quick_normals(shape: Sequence[int], like: Tensor, generator: torch.Generator
     of 150 million would be: for noise, whose size nobody knows to seven digits.
     """
     return torch.randn(shape, generator=generator, dtype=torch.float32, device=like.device).to(like.dtype)
+
+
+def episode_generator(seed: int, episode: int, part: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """A generator for the actions of a part of a random episode, by the numbers of episode and part alone."""
+    return torch.Generator(device).manual_seed(derive_seed(seed, "exploration", episode, part))
 
 
 def fresh_seed() -> int:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.dynamics.bounds import SeenTargets
 
 
 class Coordinates:
@@ -21,6 +22,7 @@ class Coordinates:
         targets: standardisation of the targets, size T.
         dtype: precision of the rollout; states come in and go out in any other. Float64 states keep their precision:
             what is added to them, and what they are standardised by, is then not rounded to that of the rollout.
+        seen: what bounds the targets of a step, if anything does; see `bounds.py`. What is NaN stays so.
 
     Attributes:
         input_mean, input_scale: of the encoded inputs, [D].
@@ -29,9 +31,17 @@ class Coordinates:
         carried, shift: the next state is carried * state + shift + what the targets add to it, [S] each. The latter two
             are along the body's axes for a vector in ``body_frame``.
         spread: what one unit of each standardised target adds to its dimension of the state, [T].
+        lowest, highest: the bounds of each standardised target, [T].
     """
 
-    def __init__(self, encoder: Encoder, inputs: Normaliser, targets: Normaliser, dtype: torch.dtype):
+    def __init__(
+        self,
+        encoder: Encoder,
+        inputs: Normaliser,
+        targets: Normaliser,
+        dtype: torch.dtype,
+        seen: SeenTargets | None = None,
+    ):
         self.encoder, self.dtype, self.inputs = encoder, dtype, inputs
         self.input_mean, self.input_scale = inputs.mean.to(dtype), (1.0 / inputs.std).to(dtype)
         size = encoder.observation_size
@@ -45,6 +55,9 @@ class Coordinates:
         self.shift[encoder.predicted] = targets.mean.to(dtype)
         self.exact_shift = torch.zeros(size, dtype=torch.float64, device=self.input_mean.device)
         self.exact_shift[encoder.predicted] = targets.mean.double()
+        self._is_bounded = seen is not None
+        seen = seen or SeenTargets.unbounded(encoder.target_size, self.input_mean.device)
+        self.lowest, self.highest = (bound.to(dtype) for bound in seen.bounds())
 
     def encode(self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"]) -> Float[Tensor, "P K D"]:
         """Standardised model inputs."""
@@ -56,13 +69,16 @@ class Coordinates:
         return raw.sub_(self.input_mean).mul_(self.input_scale)
 
     def decode(self, observation: Float[Tensor, "*b S"], target: Float[Tensor, "*b T"]) -> Float[Tensor, "*b S"]:
-        """The next observation from a standardised target, in the precision of ``observation``."""
+        """The next observation from a standardised target within its bounds, in the precision of ``observation``."""
+        target = target.to(self.dtype)
+        if self._is_bounded:
+            target = target.clamp(self.lowest, self.highest)
         if self._is_finer(observation):
-            finely = (target.to(self.dtype) @ self._spread).to(observation) + self.exact_shift
+            finely = (target @ self._spread).to(observation) + self.exact_shift
             return self.encoder.vectors.turned(finely, observation, 1.0) + observation * self.carried
         before = observation.to(self.dtype)
         kept = before if self._all_carried else before * self.carried
-        added = (target.to(self.dtype) @ self._spread).add_(self.shift)
+        added = (target @ self._spread).add_(self.shift)
         return self.encoder.vectors.turned(added, before, 1.0).add_(kept).to(observation.dtype)
 
     def _is_finer(self, observation: Tensor) -> bool:

@@ -29,6 +29,8 @@ class Followed(NamedTuple):
     positions: Float[Tensor, "n C V"]
     latents: list[Float[Tensor, "C N D"]]
     """Of every row, float32."""
+    targets: Float[Tensor, "r T"]
+    """Of the new rows, and some others at the first call."""
 
 
 class Follower:
@@ -74,38 +76,40 @@ class Follower:
         # Depends on what is given alone, so that chains that were saved and loaded go the same way.
         unsettled = _whole(latents[0].shape[1]) if latents else data.num_rows
         grown = with_latents(latents, data.num_rows, generator)
+        begin, whole = self._num_summed, _whole(data.num_rows)
+        rows = data.rows(torch.arange(begin, data.num_rows, dtype=torch.int64, device=position.device))
+        # Of what the sum does not hold yet.
+        recent = [latent[:, begin:] for latent in grown]
         if unsettled < data.num_rows:
-            self._move(position, data, grown, unsettled, generator)
-        total, whole = self._sum, _whole(data.num_rows)
-        for first in range(self._num_summed, whole, BLOCK):
-            total = total.plus(self._evidence(data, grown, first, first + BLOCK))
+            self._move(position, _part(rows, unsettled - begin), [e[:, unsettled - begin :] for e in recent], generator)
+        total = self._sum
+        for first in range(0, whole - begin, BLOCK):
+            total = total.plus(self._evidence(rows, recent, first, first + BLOCK))
         evidence = total
         if whole < data.num_rows:
-            evidence = total.plus(self._evidence(data, grown, whole, data.num_rows))
+            evidence = total.plus(self._evidence(rows, recent, whole - begin, data.num_rows - begin))
         positions = evidence.posterior(self._prepared.factorise).positions(self._inner, num_samples, generator)
         self._sum, self._num_summed = total, whole
-        return Followed(positions, grown)
+        return Followed(positions, grown, rows.y)
 
     def _move(
         self,
         position: Float[Tensor, "C V"],
-        data: DataSource,
-        latents: list[Float[Tensor, "C N D"]],
-        first: int,
+        batch: Data,
+        latents: Sequence[Float[Tensor, "C n D"]],
         generator: torch.Generator,
     ) -> None:
-        """One Metropolis step of the latents of the rows from ``first`` on, in place."""
-        batch, whitened = _rows(data, first, data.num_rows, position), self._prepared.model.split(position)
-        present = [latent[:, first:].to(position) for latent in latents]
+        """One Metropolis step of the latents of these rows, in place."""
+        whitened, present = self._prepared.model.split(position), [latent.to(position) for latent in latents]
         _, moved = move_latents(self._prepared, whitened, batch, present, generator)
         for latent, new in zip(latents, moved, strict=True):
-            latent[:, first:] = new.float()
+            latent.copy_(new)
 
     def _evidence(
-        self, data: DataSource, latents: list[Float[Tensor, "C N D"]], first: int, end: int
+        self, rows: Data, latents: Sequence[Float[Tensor, "C n D"]], first: int, end: int
     ) -> LastLayerEvidence:
         """Of the rows from ``first`` to ``end``."""
-        batch = _rows(data, first, end, self._inner)
+        batch = _part(rows, first, end)
         x = batch.x.expand(len(self._inner), -1, -1)
         passed = forward(self._prepared, self._whitened, x, [latent[:, first:end].to(x) for latent in latents])
         return last_layer_evidence(self._prepared, passed[-1], batch.y)
@@ -116,5 +120,5 @@ def _whole(num_rows: int) -> int:
     return num_rows - num_rows % BLOCK
 
 
-def _rows(data: DataSource, first: int, end: int, like: Tensor) -> Data:
-    return data.rows(torch.arange(first, end, dtype=torch.int64, device=like.device))
+def _part(rows: Data, first: int, end: int | None = None) -> Data:
+    return Data(rows.x[first:end], rows.y[first:end])

@@ -13,6 +13,7 @@ from torch import Tensor
 from gym_dgpmpc.gp.kernels import Kernel, sqdist
 from gym_dgpmpc.gp.layer import Layer
 from gym_dgpmpc.gp.linalg import cholesky
+from gym_dgpmpc.gp.projection import linear_covariance
 from gym_dgpmpc.inference import compiled_layers
 from gym_dgpmpc.inference.compiled_layers import CompiledLayer
 
@@ -31,6 +32,8 @@ class LayerTerms(NamedTuple):
     """L^-1."""
     own_slope: Float[Tensor, "C M M"]
     """dk/d(r^2) between the inducing inputs."""
+    linear: Float[Tensor, "C D"] | None
+    """Variances of the slopes of the kernel's linear part."""
     compiled: CompiledLayer | None
     """What takes the place of PyTorch."""
 
@@ -58,7 +61,7 @@ class LayerGradients(NamedTuple):
     whitened: Float[Tensor, "C M O"]
     points: Float[Tensor, "C n D"] | None
     parameters: list[Tensor] | None
-    """In the order of `gp.layer.PARAMETERS`."""
+    """In the order of `gp.layer.Layer.parameters`."""
 
 
 def layer_terms(layer: Layer, *, compile: bool = True) -> LayerTerms:
@@ -70,19 +73,22 @@ def layer_terms(layer: Layer, *, compile: bool = True) -> LayerTerms:
     lengthscale, variance = layer.lengthscale, layer.variance
     centres = layer.inducing_inputs / lengthscale.unsqueeze(-2)
     compiled = None
-    if compile and compiled_layers.can_take(layer.kernel, centres):
+    if compile and layer.slope_variance is None and compiled_layers.can_take(layer.kernel, centres):
         compiled = CompiledLayer(layer.kernel, lengthscale, variance, centres)
         correlations, own_slope = compiled.own_correlations()
         factor = cholesky(correlations, factorise=compiled_layers.factorise)
         inverse = compiled.invert(factor)
     else:
         correlations, own_slope = layer.kernel.correlation_and_slope(sqdist(centres, centres))
+        if layer.slope_variance is not None:
+            correlations = correlations + linear_covariance(centres, centres, layer.slope_variance)
         factor = cholesky(correlations)
         eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
         inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
     return LayerTerms(
-        layer.kernel, lengthscale.unsqueeze(-2), variance[:, None, None], centres, factor, inverse, own_slope, compiled
-    )
+        layer.kernel, lengthscale.unsqueeze(-2), variance[:, None, None], centres, factor, inverse, own_slope,
+        layer.slope_variance, compiled,
+    )  # fmt: skip
 
 
 def see(terms: LayerTerms, x: Float[Tensor, "C n D"]) -> Seen:
@@ -91,6 +97,8 @@ def see(terms: LayerTerms, x: Float[Tensor, "C n D"]) -> Seen:
         return Seen(*terms.compiled.see(x))
     scaled = x / terms.lengthscale
     value, slope = terms.kernel.correlation_and_slope(sqdist(scaled, terms.centres))
+    if terms.linear is not None:
+        value = value + linear_covariance(scaled, terms.centres, terms.linear)
     return Seen(scaled, terms.inverse @ value.mT, slope)
 
 
@@ -99,7 +107,8 @@ def moments(terms: LayerTerms, whitened: Float[Tensor, "C M O"], seen: Seen, lea
     if terms.compiled is not None:
         return Passed(seen, *terms.compiled.moments(whitened, seen.projected, least))
     mean = terms.variance.sqrt() * (seen.projected.mT @ whitened)
-    variance = terms.variance.squeeze(-1) * (1.0 - seen.projected.square().sum(-2))
+    own = 1.0 if terms.linear is None else 1.0 + (seen.scaled.square() * terms.linear.unsqueeze(-2)).sum(-1)
+    variance = terms.variance.squeeze(-1) * (own - seen.projected.square().sum(-2))
     return Passed(seen, mean, variance.clamp_min(least))
 
 
@@ -142,31 +151,49 @@ def layer_gradients(
         return LayerGradients(whitened_bar, None, None)
     projected_bar = scale * (whitened @ mean_bar.mT)
     projected_bar -= 2.0 * terms.variance * seen.projected * variance_bar.unsqueeze(-2)
-    by_distance = (terms.inverse.mT @ projected_bar).mT * seen.slope
+    value_bar = (terms.inverse.mT @ projected_bar).mT
+    by_distance = value_bar * seen.slope
     # d |x_i - z_j|^2 / d x_i = 2 (x_i - z_j), summed over the j.
     scaled_bar = 2.0 * (by_distance.sum(-1, keepdim=True) * seen.scaled - by_distance @ terms.centres)
+    by_own_variance = (terms.variance.squeeze(-1) * variance_bar).unsqueeze(-1)
+    if terms.linear is not None:
+        along = value_bar @ terms.centres + 2.0 * by_own_variance * seen.scaled
+        scaled_bar += along * terms.linear.unsqueeze(-2)
     points_bar = scaled_bar / terms.lengthscale if of_points else None
     if not of_parameters:
         return LayerGradients(whitened_bar, points_bar, None)
-    centres_bar = _centres_gradient(terms, seen, by_distance, projected_bar)
+    centres_bar, linear_bar = _centres_gradient(terms, seen, by_distance, value_bar, projected_bar)
     log_lengthscale_bar = -((centres_bar * terms.centres).sum(-2) + (scaled_bar * seen.scaled).sum(-2))
     log_variance_bar = 0.5 * (mean_bar * mean).sum((-2, -1)) + (variance_bar * variance).sum(-1)
     parameters_bar = [centres_bar / terms.lengthscale, log_lengthscale_bar, log_variance_bar]
+    if terms.linear is not None and linear_bar is not None:
+        linear_bar += (by_own_variance * seen.scaled.square()).sum(-2)
+        parameters_bar.append(2.0 * terms.linear * linear_bar)
     return LayerGradients(whitened_bar, points_bar, parameters_bar)
 
 
 def _centres_gradient(
-    terms: LayerTerms, seen: Seen, by_distance: Float[Tensor, "C n M"], projected_bar: Float[Tensor, "C M n"]
-) -> Float[Tensor, "C M D"]:
-    """Of the scaled inducing inputs: as `gp.projection` has it, which says where it comes from."""
+    terms: LayerTerms,
+    seen: Seen,
+    by_distance: Float[Tensor, "C n M"],
+    value_bar: Float[Tensor, "C n M"],
+    projected_bar: Float[Tensor, "C M n"],
+) -> tuple[Float[Tensor, "C M D"], Float[Tensor, "C D"] | None]:
+    """Of the scaled inducing inputs and the slopes' variances: as `gp.projection` has it, which says where from."""
     centres = terms.centres
     points = by_distance.sum(-2).unsqueeze(-1) * centres - by_distance.mT @ seen.scaled
     lower = (projected_bar @ seen.projected.mT).tril()
     lower.diagonal(dim1=-2, dim2=-1).mul_(0.5)
     covariance_bar = -(terms.inverse.mT @ lower @ terms.inverse)
-    by_own_distance = 0.5 * (covariance_bar + covariance_bar.mT) * terms.own_slope
+    symmetric = 0.5 * (covariance_bar + covariance_bar.mT)
+    by_own_distance = symmetric * terms.own_slope
     own = by_own_distance.sum(-1, keepdim=True) * centres - by_own_distance @ centres
-    return 2.0 * points + 4.0 * own
+    centres_bar = 2.0 * points + 4.0 * own
+    if terms.linear is None:
+        return centres_bar, None
+    seen_from, seen_own = value_bar.mT @ seen.scaled, symmetric @ centres
+    centres_bar += (seen_from + 2.0 * seen_own) * terms.linear.unsqueeze(-2)
+    return centres_bar, (centres * (seen_from + seen_own)).sum(-2)
 
 
 def gram(terms: LayerTerms, seen: Seen, weights: Float[Tensor, "C T n"]) -> Float[Tensor, "C T M M"]:

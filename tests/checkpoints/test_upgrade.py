@@ -149,7 +149,9 @@ def test_files_of_every_schema_hold_the_posterior_that_they_held(schema, tmp_pat
     for name, value in held.items():
         axis = 1 if name == "pool" else 0
         assert torch.equal(state[name], value.unsqueeze(axis) if has_chains(name) else value), name
-    assert set(state) - set(held) == {"oldest"} | ({"latents.0"} if schema == 5 else set())
+    new = {"oldest", "seen.lowest", "seen.highest"}
+    assert set(state) - set(held) == new | ({"latents.0"} if schema == 5 else set())
+    assert state["seen.lowest"].isneginf().all() and state["seen.highest"].isposinf().all(), "which bounds nothing"
 
     x = np.random.default_rng(0).normal(size=(6, 3))
     expected = np.mean([oracle_mean(held, flat.numpy(), x) for flat in held["pool"][:: -(-len(held["pool"]) // 2)]], 0)

@@ -403,6 +403,20 @@ def test_draws_of_a_gaussian_process_with_noise_spread_by_the_recursion(name):
     assert (spread[:, 2] == 0).all(), "a constant has no noise"
 
 
+@pytest.mark.parametrize("name", [name for name in NOISY if "MM" not in name])
+def test_steps_of_a_gaussian_process_keep_within_what_was_seen(name):
+    """And half its range on either side. (`MM` draws anew from the bounded particles' moments.)"""
+    model = CASES[name].make(add_noise=True)
+    narrow = {"seen.lowest": torch.tensor([0.1, -0.2]).double(), "seen.highest": torch.tensor([0.3, -0.1]).double()}
+    model.load_state_dict(trained_state(CASES[name].family) | narrow)
+    change = states_of(model).double().diff(dim=0)[..., :2]
+    mean, std = (model.state_dict()[f"targets.{key}"] for key in ("mean", "std"))
+    found, rounding = (change - mean) / std, 8 * 2**-24 * 2 / std  # of states of up to 2
+    lowest, highest = torch.tensor([0.0, -0.25]).double(), torch.tensor([0.4, -0.05]).double()
+    assert ((found > lowest - rounding) & (found < highest + rounding)).all()
+    assert (found < lowest + rounding).any() and (found > highest - rounding).any()
+
+
 @pytest.mark.parametrize("draw", ["TS1", "TSinf", "DS", "MM"])
 def test_draws_of_an_ensemble_with_noise_spread_by_the_recursion(draw):
     """Within five standard errors, of a variance sqrt(2 / P) of it; those of `MM` add up over the steps."""

@@ -12,20 +12,20 @@ from gym_dgpmpc.inference.layers import choose, see
 from tests.oracles.models import chains, make_model, normal, seeded
 
 
-def problem(num_layers, kernel="matern32", num_points=17):
+def problem(num_layers, kernel="matern32", num_points=17, *, linear=False):
     """Two chains, a batch, and latents."""
     generator = seeded(3)
-    model = chains(*(make_model(num_layers, 3, 2, 6, generator, kernel) for _ in range(2)))
+    model = chains(*(make_model(num_layers, 3, 2, 6, generator, kernel, linear=linear) for _ in range(2)))
     whitened = normal(generator, 2, model.num_whitened())
     latents = [normal(generator, 2, num_points, 3) for _ in range(num_layers - 1)]
     return model, whitened, normal(generator, num_points, 3), normal(generator, num_points, 2), latents
 
 
-@pytest.mark.parametrize("compile", [True, False])
+@pytest.mark.parametrize(("compile", "linear"), [(True, False), (False, False), (True, True)])
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("num_layers", [1, 2, 3])
-def test_automatic_differentiation_agrees(num_layers, kernel, compile):
-    model, whitened, x, y, latents = problem(num_layers, kernel)
+def test_automatic_differentiation_agrees(num_layers, kernel, compile, linear):
+    model, whitened, x, y, latents = problem(num_layers, kernel, linear=linear)
     factors = factorise_all(model).factors
     parameters = [parameter.requires_grad_() for parameter in model.parameters()]
     live, whitened = Factorised(model.with_parameters(parameters), factors), whitened.requires_grad_()

@@ -10,7 +10,7 @@ import torch
 from gym_dgpmpc import compiler
 from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.kernels import KERNELS, RBF
-from gym_dgpmpc.gp.layer import PARAMETERS, Layer
+from gym_dgpmpc.gp.layer import Layer
 from gym_dgpmpc.gp.linalg import cholesky
 from gym_dgpmpc.inference import compiled_layers, layers
 from gym_dgpmpc.inference.layers import Seen, gram, layer_gradients, layer_terms, moments, see
@@ -57,7 +57,9 @@ class Problem:
         named = {"factor": terms.factor, "inverse": terms.inverse, "own_slope": own_slope}
         named |= {"mean": passed.mean, "variance": passed.variance, "gram": gram(terms, seen, self.weights)}
         named |= {"whitened_bar": found.whitened, "points_bar": found.points} | seen._asdict()
-        return named | {f"{name}_bar": value for name, value in zip(PARAMETERS, found.parameters, strict=True)}
+        return named | {
+            f"{name}_bar": value for name, value in zip(self.layer.parameters(), found.parameters, strict=True)
+        }
 
 
 @needs_compiler
@@ -219,8 +221,9 @@ def test_what_the_compiled_code_does_not_have_is_left_to_pytorch():
             assert layer_terms(layer, compile=compile).compiled is None
         said.append([str(warning.message) for warning in caught])
     assert said[0] == said[2] == [] and len(said[1]) == 1 and "kernel 'own'" in said[1][0]
-    single = Layer(RBF(), *(tensor.float() for tensor in layer[1:]))
+    single = Layer(RBF(), *(tensor.float() for tensor in layer.parameters().values()))
     assert layer_terms(single).compiled is None
+    assert layer_terms(layer._replace(kernel=RBF(), log_slope=layer.log_lengthscale)).compiled is None
 
 
 @needs_compiler

@@ -40,6 +40,7 @@ class PathwiseLayer(NamedTuple):
     phases: Float[Tensor, "P F"]
     kernel_out: Float[Tensor, "T P O M"]  # sigma^2 alpha; T = H with refresh="step", else 1
     feature_out: Float[Tensor, "T P O F"]  # sigma sqrt(2 / F) w
+    linear_out: Float[Tensor, "T P O D"] | None  # of a linear part, for x over the lengthscales
 
 
 class _Layer(ctypes.Structure):
@@ -54,21 +55,15 @@ class _Layer(ctypes.Structure):
         ("phases", _Floats),
         ("kernel_out", _Floats),
         ("feature_out", _Floats),
+        ("linear_out", _Floats),
     )
 
 
 class _Task(ctypes.Structure):
     _fields_ = (
-        ("observation_size", ctypes.c_int64),
-        ("action_size", ctypes.c_int64),
-        ("input_size", ctypes.c_int64),
-        ("num_particles", ctypes.c_int64),
-        ("num_candidates", ctypes.c_int64),
-        ("horizon", ctypes.c_int64),
-        ("num_layers", ctypes.c_int64),
-        ("num_inducing", ctypes.c_int64),
-        ("num_features", ctypes.c_int64),
-        ("num_functions", ctypes.c_int64),
+        *((f"{name}_size", ctypes.c_int64) for name in ("observation", "action", "input")),
+        *((name, ctypes.c_int64) for name in ("num_particles", "num_candidates", "horizon")),
+        *((f"num_{name}", ctypes.c_int64) for name in ("layers", "inducing", "features", "functions")),
         ("input_kind", _Integers),
         ("input_source", _Integers),
         ("input_mean", _Floats),
@@ -77,6 +72,8 @@ class _Task(ctypes.Structure):
         ("shift", _Floats),
         ("spread", _Floats),
         ("target", _Integers),
+        ("lowest", _Floats),
+        ("highest", _Floats),
         ("num_vectors", ctypes.c_int64),
         ("vectors", _Integers),
         ("layers", ctypes.POINTER(_Layer)),
@@ -151,6 +148,8 @@ class CompiledRollout:
             shift=self._floats(coordinates.shift),
             spread=self._floats(spread),
             target=self._integers(target.tolist()),
+            lowest=self._floats(coordinates.lowest),
+            highest=self._floats(coordinates.highest),
             num_vectors=len(vectors),
             vectors=self._integers(vectors),
             layers=self._layers,
@@ -253,6 +252,7 @@ class CompiledRollout:
             self._floats(padded.phases),
             self._floats(padded.kernel_out),
             self._floats(padded.feature_out),
+            None if padded.linear_out is None else self._floats(padded.linear_out),
         )
 
     def _floats(self, values: Tensor) -> "ctypes._Pointer[ctypes.c_float]":

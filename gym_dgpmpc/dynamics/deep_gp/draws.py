@@ -102,7 +102,8 @@ def _draw_layer(
     """Draw ``num_functions`` functions per particle from p(f | u), by Matheron's rule.
 
     f(x) = phi(x) . w + k(x, Z) alpha with alpha = L_z^-T (v - L_z^-1 (phi(Z) w + sqrt(jitter) e)), w, e ~ N(0, I)
-    (Wilson et al. 2020, eq. 13). The term e makes the law exact for the jittered K_zz. Every particle has features of
+    (Wilson et al. 2020, eq. 13). The features of a linear part are x times its slopes' standard deviations, exactly.
+    The term e makes the law exact for the jittered K_zz. Every particle has features of
     its own, so that over the particles of one plan the law is right, and not only over plans; its functions share them,
     so all their alpha are one product of their normals (w, e) with K_zz^-1 (phi(Z), sqrt(jitter) I).
     """
@@ -112,14 +113,18 @@ def _draw_layer(
     features = draw_features(layer.kernel, num_particles, num_features, scaled.shape[-1], generator, scaled.dtype)
     columns = num_functions * outputs
     # Normals are drawn in single precision, which is six times faster and ample for random numbers.
-    shape = (num_particles, num_features + num_inducing, columns)
+    values, root = features(scaled), None
+    if layer.log_slope is not None:
+        root = layer.log_slope.exp()
+        values = torch.cat([values, scaled * root.unsqueeze(-2)], dim=2)
+    shape = (num_particles, values.shape[-1] + num_inducing, columns)
     normals = torch.randn(shape, generator=generator, dtype=torch.float32, device=scaled.device)
     variance = layer.variance[:, None, None]
     sigma = variance.sqrt()
     jitter = (JITTER**0.5 * torch.eye(num_inducing, dtype=torch.float32, device=scaled.device)).to(scaled)
-    prior = sigma * torch.cat([features(scaled), jitter.expand(num_particles, -1, -1)], dim=2)
+    prior = sigma * torch.cat([values, jitter.expand(num_particles, -1, -1)], dim=2)
     known = torch.linalg.solve_triangular(factor.mT, whitened, upper=True)
-    if columns < num_features + num_inducing:
+    if columns < prior.shape[-1]:
         response = torch.cholesky_solve(prior @ normals.to(scaled.dtype), factor)
     else:
         response = torch.cholesky_solve(prior, factor) @ normals.to(scaled.dtype)
@@ -128,6 +133,11 @@ def _draw_layer(
     def per_function(matrix: Float[Tensor, "P n columns"]) -> Float[Tensor, "T P O n"]:
         return matrix.to(dtype).mT.unflatten(1, (num_functions, outputs)).transpose(0, 1).contiguous()
 
+    linear_out = None
+    if root is not None:
+        along = root.square().unsqueeze(-1) * (scaled.mT @ alpha)
+        own = root.unsqueeze(-1) * normals[:, num_features:-num_inducing].to(scaled.dtype)
+        linear_out = per_function(variance * along + sigma * own)
     scale = layer.kernel.argument_scale
     return PathwiseLayer(
         layer.kernel,
@@ -138,6 +148,7 @@ def _draw_layer(
         (features.phase / (2 * math.pi)).to(dtype).expand(num_particles, -1).contiguous(),
         per_function(variance * alpha),
         per_function(sigma * (2.0 / num_features) ** 0.5 * normals[:, :num_features]),
+        linear_out,
     )
 
 
@@ -229,6 +240,8 @@ class PathwiseSampler:
             layer.kernel.correlation_(correlations, decay)
             torch.bmm(waves.cos_(), feature_out[own], out=out[own])
             out[own].baddbmm_(correlations, kernel_out[own])
+        if layer.linear_out is not None:
+            out.baddbmm_(scaled, layer.linear_out[function].mT)
         return out
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.dynamics.bounds import SeenTargets, take_seen
 from gym_dgpmpc.dynamics.noise import NoiseSplit, take_noise_split
 from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all
@@ -29,6 +30,7 @@ class Fitted(NamedTuple):
     latents: list[Tensor]  # "C N D" of each inner layer, float32
     pool: Tensor  # "n C V", a ring of n samples of each chain
     oldest: int  # the row of the pool that the next sample replaces
+    seen: SeenTargets
     noise: NoiseSplit | None = None  # None: not told apart
 
     def state_dict(self) -> StateDict:
@@ -39,7 +41,8 @@ class Fitted(NamedTuple):
         for index, layer in enumerate(model.layers):
             state |= {f"layers.{index}.{name}": value for name, value in layer.parameters().items()}
         state |= {f"latents.{index}": latent for index, latent in enumerate(self.latents)}
-        state |= normalisers_state(*self.normalisers) | ({} if self.noise is None else self.noise.state())
+        state |= normalisers_state(*self.normalisers) | self.seen.state()
+        state |= {} if self.noise is None else self.noise.state()
         return state | {f"chain.{name}": value for name, value in self.chain._asdict().items()}
 
     def diagnostics(self) -> dict[str, float]:
@@ -67,6 +70,7 @@ class FittedSizes(NamedTuple):
     num_samples: int
     num_inputs: int
     num_targets: int
+    linear: bool
 
 
 def take_fitted(state: StateDict, kernel: Kernel, sizes: FittedSizes, device: torch.device) -> Fitted:
@@ -81,11 +85,13 @@ def take_fitted(state: StateDict, kernel: Kernel, sizes: FittedSizes, device: to
     def take(name: str, *shape: int) -> Tensor:
         return take_tensor(state, name, shape, device)
 
-    shapes = {name: (chains, *shape) for name, shape in parameter_shapes(sizes.num_inducing, size).items()}
-    layers = (
-        Layer(kernel, **take_tensors(state, shapes, device, prefix=f"layers.{index}."))
-        for index in range(sizes.num_layers)
-    )
+    def take_layer(index: int) -> Layer:
+        linear = sizes.linear and index == sizes.num_layers - 1
+        shapes = parameter_shapes(sizes.num_inducing, size, linear=linear)
+        of_chains = {name: (chains, *shape) for name, shape in shapes.items()}
+        return Layer(kernel, **take_tensors(state, of_chains, device, prefix=f"layers.{index}."))
+
+    layers = (take_layer(index) for index in range(sizes.num_layers))
     model = DeepGP(tuple(layers), take("log_noise", chains, num_targets))
     normalisers = (
         take_normaliser(state, "inputs", size, device),
@@ -96,8 +102,8 @@ def take_fitted(state: StateDict, kernel: Kernel, sizes: FittedSizes, device: to
     if not isinstance(oldest, int) or not 0 <= oldest < sizes.num_samples:
         raise ValueError(f"dynamics state 'oldest': expected one of 0 to {sizes.num_samples - 1}, received {oldest!r}")
     latents = [_take_latent(state, f"latents.{index}", chains, size, device) for index in range(sizes.num_layers - 1)]
-    noise = take_noise_split(state, num_targets, device)
-    return Fitted(factorise_all(model), normalisers, chain, latents, pool, oldest, noise)
+    seen, noise = take_seen(state, num_targets, device), take_noise_split(state, num_targets, device)
+    return Fitted(factorise_all(model), normalisers, chain, latents, pool, oldest, seen, noise)
 
 
 def _take_latent(

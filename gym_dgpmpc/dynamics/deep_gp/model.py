@@ -17,6 +17,7 @@ from torch import Tensor
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.data.standardised import Data
+from gym_dgpmpc.dynamics.bounds import SeenTargets
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp import compiled_rollout
 from gym_dgpmpc.dynamics.deep_gp.draws import (
@@ -55,6 +56,8 @@ class _Standardised(NamedTuple):
         return self.transitions.observation.shape[0]
 
     def rows(self, index: Tensor) -> Data:
+        if len(index) == 0:  # which encoding refuses
+            return Data(*(normaliser.mean.new_empty(0, len(normaliser.mean)) for normaliser in self.normalisers))
         # The store is on the CPU, whatever the model's device.
         picked = index.to(self.transitions.observation.device)
         x, y = self.encode(Transitions(*(field[picked] for field in self.transitions)))
@@ -71,6 +74,8 @@ class DeepGPDynamics(Learner[Fitted]):
         num_layers: layers of the deep GP, L; with 1 it is an ordinary sparse GP.
         kernel: covariance function of every layer, from the smoothest functions to the roughest: rbf, matern72,
             matern52, matern32 or matern12.
+        linear: add a linear part to the last layer's kernel, whose slopes are inferred with all else: far from all
+            data the model goes on along a line, instead of back to the mean.
         num_inducing: inducing points per layer, M; more of them follow finer detail and cost more time.
         draw: how a world is drawn from the posterior: "pathwise" (whole functions), "joint" (values, jointly over the
             candidate sequences, as in the paper) or "marginal" (values, each candidate on its own).
@@ -121,6 +126,7 @@ class DeepGPDynamics(Learner[Fitted]):
         *,
         num_layers: int = 2,
         kernel: str = "matern32",
+        linear: bool = False,
         num_inducing: int = 100,
         draw: Draw = "pathwise",
         refresh: Refresh = "plan",
@@ -162,7 +168,8 @@ class DeepGPDynamics(Learner[Fitted]):
         noise = {"add_noise": add_noise, "split_noise": split_noise}
         super().__init__(observation_size, action_size, observation_spec, dtype, device, **noise)
         self.kernel: Kernel = find_kernel(kernel)
-        self.num_layers, self.num_inducing, self.num_features = num_layers, num_inducing, num_features
+        self.num_layers, self.linear = num_layers, linear
+        self.num_inducing, self.num_features = num_inducing, num_features
         self.draw_kind, self.refresh = draw, refresh
         self.first_training_iterations, self.training_iterations = first_training_iterations, training_iterations
         self.num_chains, self.num_samples, self.sample_spacing = num_chains, num_samples, sample_spacing
@@ -185,9 +192,8 @@ class DeepGPDynamics(Learner[Fitted]):
         normalisers, standardised = self._standardised(data)
         if self._fitted is None:
             iterations, settled = self.first_training_iterations, False
-            model = initial_model(
-                self.kernel, standardised, self.num_layers, self.num_inducing, self.num_chains, generator
-            )
+            sizes = self.num_layers, self.num_inducing, self.num_chains
+            model = initial_model(self.kernel, standardised, *sizes, generator, linear=self.linear)
             whitened = sghmc.init(standardised.x.new_zeros(self.num_chains, model.num_whitened()))
         else:
             iterations, settled, last = self.training_iterations, True, self._fitted
@@ -225,7 +231,8 @@ class DeepGPDynamics(Learner[Fitted]):
         noise = self._split_noise(data, normalisers, posterior_mean(factorised, sampled.pool), variance)
         latents = [latent.float() for latent in sampled.state.latents]
         self._follower = None
-        self._fitted = Fitted(factorised, normalisers, sampled.state.whitened, latents, sampled.pool, 0, noise)
+        seen = SeenTargets.of(standardised.y)
+        self._fitted = Fitted(factorised, normalisers, sampled.state.whitened, latents, sampled.pool, 0, seen, noise)
         counts = {"iterations": float(trained.num_iterations), "rollbacks": float(trained.num_rollbacks)}
         metrics = {"negative_log_likelihood": trained.negative_log_likelihood} | counts
         return metrics | self._fitted.diagnostics() | self._noise_metrics(noise, normalisers[1], variance)
@@ -233,8 +240,8 @@ class DeepGPDynamics(Learner[Fitted]):
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """Follow the grown data: in every chain exact draws of the last layer replace the oldest samples.
 
-        Hyperparameters and inner layers stay as they are until the next fit. Where the new data make the posterior
-        impossible to compute, the samples stay as they were.
+        Hyperparameters and inner layers stay as they are until the next fit; steps may become as large as the new ones.
+        Where the new data make the posterior impossible to compute, all stays as it was.
 
         Returns:
             ``resamplings_dropped``: 1 if that happened, otherwise 0; an empty mapping if there is nothing to replace.
@@ -251,7 +258,7 @@ class DeepGPDynamics(Learner[Fitted]):
         standardised = _Standardised(self._encode, data, fitted.normalisers)
         count = self._samples_of_chain
         try:
-            newest, latents = self._follower.follow(
+            newest, latents, targets = self._follower.follow(
                 position, standardised, fitted.latents, self.resample_samples, generator
             )
         except FactorisationError:
@@ -259,7 +266,8 @@ class DeepGPDynamics(Learner[Fitted]):
         rows = (fitted.oldest + torch.arange(len(newest), dtype=torch.int64, device=self.device)) % count
         fitted.pool[rows] = newest
         chain, oldest = fitted.chain._replace(position=newest[-1]), (fitted.oldest + len(newest)) % count
-        self._fitted = fitted._replace(chain=chain, latents=latents, oldest=oldest)
+        seen = fitted.seen.and_of(targets)
+        self._fitted = fitted._replace(chain=chain, latents=latents, oldest=oldest, seen=seen)
         return {"resamplings_dropped": 0.0}
 
     def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
@@ -273,7 +281,7 @@ class DeepGPDynamics(Learner[Fitted]):
         model = fitted.factorised.model.at(chain)
         factorised = Factorised(model, [factor[chain] for factor in fitted.factorised.factors])
         posterior = Posterior(factorised, model.split(fitted.pool[row, chain]))
-        coordinates = Coordinates(self.encoder, *fitted.normalisers, self.dtype)
+        coordinates = Coordinates(self.encoder, *fitted.normalisers, self.dtype, fitted.seen)
         drawn = self._drawn_noise(fitted.noise)
         process_std = (model.noise_variance * drawn.process_share).sqrt() if self.add_noise else None
         blur = drawn.observation(self.encoder)
@@ -338,6 +346,7 @@ class DeepGPDynamics(Learner[Fitted]):
             num_samples=self._samples_of_chain,
             num_inputs=self.encoder.input_size,
             num_targets=self.encoder.target_size,
+            linear=self.linear,
         )
         self._fitted, self._follower = take_fitted(state, self.kernel, expected, self.device), None
 

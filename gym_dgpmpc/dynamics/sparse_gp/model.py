@@ -16,6 +16,7 @@ from torch import Tensor
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.data.standardised import Data
+from gym_dgpmpc.dynamics.bounds import SeenTargets, take_seen
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp.start import restandardise
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, GaussianSampler
@@ -41,6 +42,7 @@ class _Fitted(NamedTuple):
     model: DeepGP  # of one layer
     normalisers: tuple[Normaliser, Normaliser]
     posterior: SparsePosterior
+    seen: SeenTargets
     noise: NoiseSplit | None = None  # None: not told apart
 
 
@@ -135,7 +137,7 @@ class SparseGPDynamics(Learner[_Fitted]):
             return sparse_predict(found.model.layers[0], variance, posterior, x)[0]
 
         noise = self._split_noise(data, normalisers, predict, variance)
-        self._fitted = _Fitted(found.model, normalisers, posterior, noise)
+        self._fitted = _Fitted(found.model, normalisers, posterior, SeenTargets.of(standardised.y), noise)
         return {
             "bound": found.bound,
             "evaluations": float(found.num_evaluations),
@@ -157,7 +159,8 @@ class SparseGPDynamics(Learner[_Fitted]):
             if self.exact:  # the new transitions are inducing points too
                 model = model._replace(layers=(model.layers[0]._replace(inducing_inputs=standardised.x),))
             posterior = sparse_posterior(model.layers[0], model.noise_variance, *standardised)
-            self._fitted = fitted._replace(model=model, posterior=posterior)
+            seen = fitted.seen.and_of(standardised.y)
+            self._fitted = fitted._replace(model=model, posterior=posterior, seen=seen)
         return {}
 
     def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
@@ -167,7 +170,7 @@ class SparseGPDynamics(Learner[_Fitted]):
             RuntimeError: the model was not fitted.
             ValueError: there are too few particles for "AMM".
         """
-        model, normalisers, posterior, found = self._require_fit("draw")
+        model, normalisers, posterior, seen, found = self._require_fit("draw")
         drawn = self._drawn_noise(found)
         noise = model.noise_variance * drawn.process_share
         if self.draw_kind == "AMM":
@@ -178,12 +181,12 @@ class SparseGPDynamics(Learner[_Fitted]):
             mean, variance = sparse_predict(model.layers[0], model.noise_variance, posterior, x.double())
             return Gaussian(mean, variance + noise)
 
-        coordinates = Coordinates(self.encoder, *normalisers, self.dtype)
+        coordinates = Coordinates(self.encoder, *normalisers, self.dtype, seen)
         sampler = GaussianSampler(predict, coordinates, generator, match_moments=self.draw_kind == "MM")
         return observed(sampler, drawn.observation(self.encoder), generator)
 
     def _mixture(self, x: Float[Tensor, "n D"], generator: torch.Generator) -> Mixture:
-        model, (inputs, targets), posterior, _ = self._require_fit("predict")
+        model, (inputs, targets), posterior, *_ = self._require_fit("predict")
         mean, variance = sparse_predict(model.layers[0], model.noise_variance, posterior, inputs(x))
         variance = (variance + model.noise_variance) * targets.std.square()
         return Mixture(targets.inverse(mean).unsqueeze(0), variance.unsqueeze(0))
@@ -192,9 +195,9 @@ class SparseGPDynamics(Learner[_Fitted]):
         """Hyperparameters, normalisers and the posterior; empty before the first fit."""
         if self._fitted is None:
             return {}
-        model, normalisers, posterior, noise = self._fitted
+        model, normalisers, posterior, seen, noise = self._fitted
         state: StateDict = {**model.layers[0].parameters(), "log_noise": model.log_noise}
-        state |= normalisers_state(*normalisers) | ({} if noise is None else noise.state())
+        state |= normalisers_state(*normalisers) | seen.state() | ({} if noise is None else noise.state())
         return state | {f"posterior.{key}": value for key, value in posterior._asdict().items()}
 
     def load_state_dict(self, state: StateDict) -> None:
@@ -219,7 +222,8 @@ class SparseGPDynamics(Learner[_Fitted]):
         )
         shapes = dict(zip(SparsePosterior._fields, ((count, count), (count,), (count, sizes[1])), strict=True))
         posterior = SparsePosterior(**take_tensors(state, shapes, device, prefix="posterior."))
-        self._fitted = _Fitted(model, normalisers, posterior, take_noise_split(state, sizes[1], device))
+        seen, noise = take_seen(state, sizes[1], device), take_noise_split(state, sizes[1], device)
+        self._fitted = _Fitted(model, normalisers, posterior, seen, noise)
 
     def _start(self, data: Data, normalisers: tuple[Normaliser, Normaliser], generator: torch.Generator) -> DeepGP:
         """Hyperparameters of the last training in the new standardisation, or fixed ones; fresh inducing inputs."""

@@ -13,6 +13,7 @@ import torch
 from gym_dgpmpc import compiler
 from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
+from gym_dgpmpc.dynamics.bounds import SeenTargets
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp.draws import CompiledPathwiseSampler, PathwiseSampler, Posterior
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics, compiled_rollout
@@ -52,6 +53,8 @@ class Draw:
         num_features=22,
         offset=0.0,
         with_noise=False,
+        seen=None,
+        linear=False,
     ):
         generator = seeded(3)
         encoder = Encoder(3, 2, spec)
@@ -63,7 +66,7 @@ class Draw:
         inputs.mean[: len(encoder.plain)] += (torch.zeros(3).double() + offset)[encoder.plain]
         targets.mean.add_(((torch.zeros(3).double() + offset) * (1.0 - encoder.carried))[encoder.predicted])
         sizes = num_layers, encoder.input_size, encoder.target_size, num_inducing
-        model = chains(*(make_model(*sizes, generator) for _ in range(PARTICLES)))
+        model = chains(*(make_model(*sizes, generator, linear=linear) for _ in range(PARTICLES)))
         names = kernel if isinstance(kernel, tuple) else (kernel,) * num_layers
         layers = zip(model.layers, names, strict=True)
         model = model._replace(layers=tuple(layer._replace(kernel=KERNELS[name]) for layer, name in layers))
@@ -78,10 +81,10 @@ class Draw:
             noise = 0.1 + 0.1 * torch.rand(PARTICLES, encoder.target_size, generator=generator).double(), blur
 
         def sampler(dtype):
-            coordinates = Coordinates(encoder, inputs, targets, dtype)
+            coordinates = Coordinates(encoder, inputs, targets, dtype, seen)
             return PathwiseSampler(posterior, coordinates, HORIZON, num_features, refresh, dtype, seeded(), noise)
 
-        single = Coordinates(encoder, inputs, targets, torch.float32)
+        single = Coordinates(encoder, inputs, targets, torch.float32, seen)
         self.compiled = CompiledPathwiseSampler(posterior, single, HORIZON, num_features, refresh, seeded(), noise)
         self.single, self.double = sampler(torch.float32), sampler(torch.float64)
         self.observation = normal(generator, 3).float()
@@ -103,6 +106,15 @@ def errors(draw, actions):
     exact = torch.stack([draw.double(found[t].double(), actions[:, t].double(), t) for t in range(HORIZON)])
     by_torch = torch.stack([draw.single(found[t].clone(), actions[:, t], t) for t in range(HORIZON)])
     return (found[1:] - exact).abs().max(), (by_torch - exact).abs().max()
+
+
+@pytest.mark.parametrize("num_layers", [1, 3])
+@pytest.mark.parametrize("refresh", ["step", "plan"])
+def test_a_linear_part_is_as_exact(num_layers, refresh):
+    draw = Draw("matern32", num_layers, refresh=refresh, linear=True)
+    compiled, by_torch = errors(draw, draw.actions(40))
+    assert compiled < max(10 * by_torch, 1e-5)
+    assert all((layer.linear_out is not None) == (layer is draw.single.layers[-1]) for layer in draw.single.layers)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -132,6 +144,28 @@ def test_is_as_exact_with_noise(spec, refresh):
     silent = Draw("matern32", 2, spec, refresh).compiled.trajectories(draw.observation, actions)
     others = [i for i in range(3) if i not in constant]
     assert ((states - silent)[1:, ..., others].abs().amax((0, 2)) > 1e-3).all()
+
+
+def test_steps_keep_within_their_bounds_as_by_pytorch():
+    """Of one target they are so narrow that each step meets them, of the others wide: of these nothing changes."""
+    free, actions = Draw("matern32", 2, SPECS[0], with_noise=True), Draw("matern32", 2).actions(40)
+    wide = torch.full((3,), 50.0, dtype=torch.float64)
+    narrow = SeenTargets(torch.tensor([-50.0, 0.01, -50.0]).double(), torch.tensor([50.0, 0.02, 50.0]).double())
+    untouched = Draw("matern32", 2, SPECS[0], with_noise=True, seen=SeenTargets(-wide, wide))
+    states = free.compiled.trajectories(free.observation, actions)
+    assert torch.equal(untouched.compiled.trajectories(free.observation, actions), states)
+    bounded = Draw("matern32", 2, SPECS[0], with_noise=True, seen=narrow)
+    compiled, by_torch = errors(bounded, actions)
+    assert compiled < max(10 * by_torch, 1e-5)
+    # The first step alone begins from the same states.
+    found = bounded.compiled.trajectories(bounded.observation, actions)
+    assert torch.equal(found[1, ..., [0, 2]], states[1, ..., [0, 2]])
+    assert (found[1, ..., 1] - states[1, ..., 1]).abs().max() > 1e-3
+    actions[1, 2] = math.nan
+    spoilt = bounded.compiled.trajectories(bounded.observation, actions)
+    assert spoilt[3:, :, 1].isnan().all(), "a bound is no way back from NaN"
+    others = [0, *range(2, 40)]
+    assert torch.equal(spoilt[:, :, others], found[:, :, others])
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

@@ -1,10 +1,12 @@
 """The dynamics model as the agent uses it: fit, resample, draw, save and load, at tiny sizes."""
 
+import math
 import re
 
 import pytest
 import torch
 
+from gym_dgpmpc.dynamics.bounds import SeenTargets
 from gym_dgpmpc.dynamics.deep_gp import start as deep_gp_start
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.errors import TrainingError
@@ -64,6 +66,39 @@ def test_the_same_seed_gives_the_same_run(draw):
 
     assert torch.equal(run(0), run(0))
     assert not torch.equal(run(0), run(1))
+
+
+@pytest.mark.parametrize("num_layers", [1, 2])
+def test_with_a_linear_part_a_line_is_known_far_from_all_data(num_layers):
+    """Four times as far as the data go; without it the model has nothing to say there but its prior."""
+    observation = torch.rand(60, 1, generator=seeded(), dtype=torch.float64) * 2 - 1
+    action = torch.rand(60, 1, generator=seeded(1), dtype=torch.float64) * 2 - 1
+    data = Transitions(observation, action, observation + 0.3 * observation - 0.2 * action)
+    far = torch.tensor([[4.0], [-4.0]]).double()
+    tested = Transitions(far, torch.zeros_like(far), 1.3 * far)
+    changes, spreads = [], []
+    for linear in (True, False):
+        sizes = {"num_layers": num_layers, "num_inducing": 20, "first_training_iterations": 150}
+        model = DeepGPDynamics(1, 1, **(TINY | sizes), linear=linear)
+        model.fit(data, seeded(2))
+        found = model.predictive(tested, seeded(3))
+        changes.append(found.mean.squeeze(-1) / 1.2 * far.sign().squeeze(-1))
+        spreads.append(found.variance.sqrt().squeeze(-1) / 1.2)
+    assert ((changes[0] - 1.0).abs() < 3 * spreads[0]).all() and changes[0].min() > 0.5
+    assert changes[1].max() < 0.5
+
+
+@pytest.mark.parametrize("num_layers", [1, 2])
+def test_a_linear_part_goes_through_fits_files_and_episodes(num_layers):
+    model = fitted(linear=True, num_layers=num_layers)
+    generator = seeded(4)
+    model.fit(pendulum.simulate(40), generator)
+    model.resample(pendulum.simulate(41), generator)
+    other = tiny(linear=True, num_layers=num_layers)
+    other.load_state_dict(model.state_dict())
+    assert torch.equal(predictions(other), predictions(model))
+    slopes = [name for name in model.state_dict() if name.endswith("log_slope")]
+    assert slopes == [f"layers.{num_layers - 1}.log_slope"]
 
 
 @pytest.mark.parametrize("num_steps", [1, 2, 5])
@@ -131,7 +166,7 @@ def test_resampling_replaces_the_oldest_rows_of_the_pool_and_nothing_else(asked,
         assert state["oldest"] == oldest
         assert torch.equal(state["pool"][newest], state["chain.position"])
         moved = {name for name, value in before.items() if not torch.equal(torch.as_tensor(state[name]), value)}
-        assert moved - {"oldest"} == {"pool", "chain.position", "latents.0"}
+        assert moved - {"oldest", "seen.lowest", "seen.highest"} == {"pool", "chain.position", "latents.0"}
         # Of the inner layers every new sample has what the chain has.
         position = before["chain.position"][:, :inner]
         assert torch.equal(state["chain.position"][:, :inner], position)
@@ -198,7 +233,7 @@ def test_particles_are_distinct_samples_while_the_pool_lasts():
         for name, value in state.items()
         if name.startswith("layers.") or name == "log_noise"
     }
-    model.load_state_dict(state | alike | {"pool": pool})
+    model.load_state_dict(state | alike | SeenTargets.unbounded(2, model.device).state() | {"pool": pool})
     sampler = model.draw(10, 1, seeded())
     # Samples a hundred standard deviations apart tell which particle holds which.
     raw = alike["layers.0.inducing_inputs"][0] * state["inputs.std"] + state["inputs.mean"]
@@ -297,6 +332,7 @@ def test_an_unfitted_model_saves_and_loads_too():
     [
         ({"num_inducing": 9}, "layers.0.inducing_inputs", (2, 9, 4), (2, 8, 4)),
         ({"num_layers": 3}, "layers.2.inducing_inputs", (2, 8, 4), None),
+        ({"linear": True}, "layers.1.log_slope", (2, 4), None),
         ({"num_samples": 10}, "pool", (5, 2, 48), (4, 2, 48)),
         ({"num_chains": 4}, "layers.0.inducing_inputs", (4, 8, 4), (2, 8, 4)),
     ],
@@ -431,6 +467,47 @@ def test_resampling_encodes_the_rows_it_needs_and_no_others(num_layers):
         model.resample(data, generator)
         # For the moves of the latents and for the sums; those of a block that has become whole, and of the rest.
         assert sum(seen) <= 2 * BLOCK
+
+
+def seen_by(model, data):
+    """The least and the greatest standardised targets of the data."""
+    _, y = model._encode(data)
+    return model._fitted.normalisers[1](y).aminmax(dim=0)
+
+
+@pytest.mark.parametrize("num_layers", [1, 2])
+def test_steps_are_bounded_by_all_that_was_seen(num_layers):
+    """By the fit, and by what came since: many rows at once, a row at a time, and none."""
+    model, generator = fitted(20, num_layers=num_layers), seeded()
+    for num_steps in (20, 21, 2 * BLOCK, 2 * BLOCK, 3 * BLOCK + 1, 3 * BLOCK + 2):
+        data = pendulum.simulate(num_steps)
+        if num_steps > 20:
+            model.resample(data, generator)
+        assert all(torch.equal(*pair) for pair in zip(model._fitted.seen, seen_by(model, data), strict=True))
+    model.fit(pendulum.simulate(30), generator)
+    expected = seen_by(model, pendulum.simulate(30))
+    assert all(torch.equal(*pair) for pair in zip(model._fitted.seen, expected, strict=True))
+
+
+@pytest.mark.parametrize("draw", ["pathwise", "joint", "marginal"])
+@pytest.mark.parametrize("compile", [True, False])
+def test_particles_far_from_all_data_do_not_run_away(draw, compile):
+    """Where the prior is ten thousand times as wide as the data, noise included."""
+    model = fitted(draw=draw, compile=compile)
+    state = model.state_dict()
+    wide = {name: state[name] + 2 * math.log(1e4) for name in ("layers.1.log_variance", "log_noise")}
+    model.load_state_dict(state | wide)
+    targets, (lowest, highest) = model._fitted.normalisers[1], model._fitted.seen.bounds()
+    start, actions = torch.tensor([40.0, 50.0]), torch.rand(6, 4, 1, generator=seeded(1)) * 2 - 1
+    states = rollout(model.draw(3, 4, seeded(5)), start, actions, 3).double()
+    change = targets(states[1:] - states[:-1])
+    rounding = 8 * 2**-24 * states.abs().amax() / targets.std
+    assert ((change > lowest - rounding) & (change < highest + rounding)).all()
+    assert (change - lowest).abs().amin() < rounding.max() and (change - highest).abs().amin() < rounding.max()
+    # As files of earlier versions are: without bounds, since what was seen is not in them.
+    model.load_state_dict({name: value for name, value in model.state_dict().items() if not name.startswith("seen")})
+    unbounded = rollout(model.draw(3, 4, seeded(5)), start, actions, 3).double()
+    assert targets(unbounded[1] - unbounded[0]).abs().max() > 1e3
 
 
 def test_clustering_looks_at_a_bounded_number_of_rows(monkeypatch):

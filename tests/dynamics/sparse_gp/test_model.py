@@ -110,6 +110,7 @@ def test_within_an_episode_the_data_count_if_asked():
         model.resample(grown, seeded())
         distances = [float((each - odd.next_observation).norm()) for each in (before, one_step(model, odd).mean(0))]
         assert (distances[1] < 0.9 * distances[0]) == update
+        assert torch.equal(model.state_dict()["seen.highest"], hyperparameters["seen.highest"]) != update
         for name in ("inducing_inputs", "log_lengthscale", "log_variance", "log_noise", "inputs.mean", "targets.std"):
             assert torch.equal(model.state_dict()[name], hyperparameters[name])
 

@@ -48,6 +48,7 @@ struct Layer {
   const float *phases;        // [P, F], in turns
   const float *kernel_out;    // [T, P, O, M]
   const float *feature_out;   // [T, P, O, F]
+  const float *linear_out;    // [T, P, O, D], or null
 };
 
 struct Task {
@@ -62,6 +63,7 @@ struct Task {
   const float *carried, *shift;                        // [S]: s' = carried s + shift + spread out[target]
   const float *spread;                                 // [S]
   const int64_t *target;                               // [S]: which output, or -1
+  const float *lowest, *highest;                       // [T]: bounds of the outputs, noise included
   int64_t num_vectors;
   const int64_t *vectors;       // [num_vectors, 3]: where heading, x and y are; what is added to x, y is along the body
   const Layer *layers;                                 // [L]
@@ -240,6 +242,13 @@ void evaluate(const Task &task, const Layer &layer, const float *kernel_out, con
   }
 }
 
+// Added to the outputs: the linear part, of the inputs over the lengthscales.
+void add_linear(const float *weights, int64_t inputs, int64_t outputs, const vec *x, vec *out) {
+  for (int64_t o = 0; o < outputs; o++, weights += inputs)
+    for (int64_t d = 0; d < inputs; d++)
+      for (int v = 0; v < VECTORS; v++) out[o * VECTORS + v] += x[d * VECTORS + v] * weights[d];
+}
+
 // The kernels by their numbers. Each layer has its own, so `evaluate` is called through a pointer: once for some ten
 // thousand numbers between the two products, which is nothing.
 struct Entry {
@@ -366,15 +375,20 @@ void run(const Task &task, int64_t particle, int64_t first, int64_t last, vec *s
         KERNELS::entries[layer.kernel].evaluate(
             task, layer, layer.kernel_out + function * layer.outputs * task.num_inducing,
             layer.feature_out + function * layer.outputs * task.num_features, scaled, out);
+        if (layer.linear_out)
+          add_linear(layer.linear_out + function * layer.outputs * inputs, inputs, layer.outputs, scaled, out);
         if (l + 1 < task.num_layers)
           for (int64_t i = 0; i < inputs * VECTORS; i++) input[i] += out[i];
       }
+      const int64_t outputs = task.layers[task.num_layers - 1].outputs;
       if (task.noise) {
-        const int64_t outputs = task.layers[task.num_layers - 1].outputs;
         const float *noise = task.noise + (step * task.num_particles + particle) * outputs;
         for (int64_t o = 0; o < outputs; o++)
           for (int v = 0; v < VECTORS; v++) out[o * VECTORS + v] += noise[o];
       }
+      for (int64_t o = 0; o < outputs; o++)
+        for (int v = 0; v < VECTORS; v++)
+          out[o * VECTORS + v] = clamped(out[o * VECTORS + v], task.lowest[o], task.highest[o]);
       decode(task, out, state, moved);
     }
   }
