@@ -30,6 +30,7 @@ class _Layer(ctypes.Structure):
         ("lengthscale", _Doubles),
         ("variance", _Doubles),
         ("centres", _Doubles),
+        ("linear", _Doubles),
         ("own_slope", _Doubles),
         ("inverse", _Doubles),
     )
@@ -52,6 +53,7 @@ class _Points(ctypes.Structure):
         ("inducing_bar", _Doubles),
         ("log_lengthscale_bar", _Doubles),
         ("log_variance_bar", _Doubles),
+        ("log_slope_bar", _Doubles),
     )
 
 
@@ -59,7 +61,7 @@ _ARGUMENTS = {
     "own_correlations": (_Doubles, _Doubles),
     "invert": (_Doubles, _Doubles),
     "see": (_Count, _Doubles, _Count, _Doubles, _Doubles, _Doubles),
-    "moments": (_Count, _Doubles, _Count, _Doubles, ctypes.c_double, _Doubles, _Doubles),
+    "moments": (_Count, _Doubles, _Count, _Doubles, _Doubles, ctypes.c_double, _Doubles, _Doubles),
     "back": (ctypes.POINTER(_Points),),
     "gram": (_Count, _Doubles, _Count, _Doubles, _Doubles),
     "copy": (_Count, _Doubles, _Doubles, _Doubles),
@@ -90,6 +92,7 @@ class CompiledLayer:
         kernel: of all chains.
         lengthscale, variance: of each.
         centres: inducing inputs over the lengthscales.
+        linear: variances of the slopes of the kernel's linear part, if it has one.
 
     Raises:
         MemoryError: by most methods, where some hundred kilobytes a thread could not be allocated.
@@ -101,9 +104,12 @@ class CompiledLayer:
         lengthscale: Float[Tensor, "C D"],
         variance: Float[Tensor, "C"],
         centres: Float[Tensor, "C M D"],
+        linear: Float[Tensor, "C D"] | None = None,
     ):
         self._chains, self._size, self._inputs = centres.shape
-        self._kept_alive = [tensor.contiguous() for tensor in (lengthscale, variance, centres)]
+        self._is_linear = linear is not None
+        given = (lengthscale, variance, centres) if linear is None else (lengthscale, variance, centres, linear)
+        self._kept_alive = [tensor.contiguous() for tensor in given]
         pointers = (tensor.data_ptr() for tensor in self._kept_alive)
         self._layer = _Layer(_kernel_number(kernel), self._size, self._inputs, *pointers)
 
@@ -135,15 +141,19 @@ class CompiledLayer:
         return scaled, projected.mT, slope
 
     def moments(
-        self, whitened: Float[Tensor, "C M O"], projected: Float[Tensor, "C M n"], least: float
+        self,
+        whitened: Float[Tensor, "C M O"],
+        scaled: Float[Tensor, "C n D"],
+        projected: Float[Tensor, "C M n"],
+        least: float,
     ) -> tuple[Float[Tensor, "C n O"], Float[Tensor, "C n"]]:
         """Mean and variance of `layers.Passed`."""
-        whitened, by_point = whitened.contiguous(), self._in_place(projected.mT)
+        whitened, scaled, by_point = whitened.contiguous(), scaled.contiguous(), self._in_place(projected.mT)
         num_points, outputs = by_point.shape[1], whitened.shape[2]
         mean, variance = self._new(num_points, outputs), self._new(num_points)
         self._call(
-            "moments", outputs, whitened.data_ptr(), num_points, by_point.data_ptr(), least, mean.data_ptr(),
-            variance.data_ptr(),
+            "moments", outputs, whitened.data_ptr(), num_points, scaled.data_ptr(), by_point.data_ptr(), least,
+            mean.data_ptr(), variance.data_ptr(),
         )  # fmt: skip
         return mean, variance
 
@@ -166,7 +176,8 @@ class CompiledLayer:
         )  # fmt: skip
         whitened_bar = self._new(self._size, outputs)
         points_bar = self._new(num_points, self._inputs) if of_points else None
-        shapes = ((self._size, self._inputs), (self._inputs,), ()) if of_parameters else ()
+        slopes = [(self._inputs,)] if self._is_linear else []
+        shapes = [(self._size, self._inputs), (self._inputs,), (), *slopes] if of_parameters else []
         parameters_bar = [self._new(*shape) for shape in shapes]
         pointers = [tensor.data_ptr() for tensor in (*given, whitened_bar)]
         pointers.append(0 if points_bar is None else points_bar.data_ptr())

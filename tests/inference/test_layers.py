@@ -31,7 +31,7 @@ needs_compiler = pytest.mark.skipif(
 class Problem:
     """A layer of chains that differ, points, and gradients of their moments."""
 
-    def __init__(self, kernel="matern32", sizes=SIZES[1], nudge=0.0):
+    def __init__(self, kernel="matern32", sizes=SIZES[1], nudge=0.0, *, linear=False):
         chains, num_points, num_inducing, inputs, outputs = sizes
         generator, other = seeded(3), seeded(4)
 
@@ -39,7 +39,9 @@ class Problem:
             return normal(generator, *shape) * (1.0 + nudge * normal(other, *shape))
 
         log_lengthscale = math.log(math.sqrt(inputs)) + 0.2 * draw(chains, inputs)
-        self.layer = Layer(KERNELS[kernel], draw(chains, num_inducing, inputs), log_lengthscale, 0.5 * draw(chains))
+        log_slope = draw(chains, inputs) - 0.5 if linear else None
+        centres, log_variance = draw(chains, num_inducing, inputs), 0.5 * draw(chains)
+        self.layer = Layer(KERNELS[kernel], centres, log_lengthscale, log_variance, log_slope)
         self.terms = layer_terms(self.layer)
         self.points, self.whitened = draw(chains, num_points, inputs), draw(chains, num_inducing, outputs)
         self.mean_bar, self.variance_bar = draw(chains, num_points, outputs), draw(chains, num_points)
@@ -64,11 +66,11 @@ class Problem:
 
 @needs_compiler
 @pytest.mark.parametrize("sizes", SIZES)
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_compiled_layers_are_pytorchs(kernel, sizes):
-    problem = Problem(kernel, sizes)
+@pytest.mark.parametrize(("kernel", "linear"), [*((kernel, False) for kernel in KERNELS), ("matern32", True)])
+def test_compiled_layers_are_pytorchs(kernel, linear, sizes):
+    problem = Problem(kernel, sizes, linear=linear)
     found, expected = problem.numbers(compile=True), problem.numbers(compile=False)
-    nudged = Problem(kernel, sizes, NUDGE).numbers(compile=False)
+    nudged = Problem(kernel, sizes, NUDGE, linear=linear).numbers(compile=False)
     # Where a centre meets itself its own slope cancels, that of Matern-1/2 a million times larger than others.
     steepest = 1.0 + float(problem.terms.own_slope.abs().max())
     cancelling = dict.fromkeys(("inducing_inputs_bar", "log_lengthscale_bar"), steepest)
@@ -117,8 +119,9 @@ def test_variances_have_a_bound():
 
 
 @needs_compiler
-def test_only_what_is_wanted_is_computed():
-    problem = Problem()
+@pytest.mark.parametrize("linear", [False, True])
+def test_only_what_is_wanted_is_computed(linear):
+    problem = Problem(linear=linear)
     seen = see(problem.terms, problem.points)
     passed = moments(problem.terms, problem.whitened, seen, 0.0)
     given = problem.terms, problem.whitened, passed, problem.mean_bar, problem.variance_bar
@@ -223,7 +226,6 @@ def test_what_the_compiled_code_does_not_have_is_left_to_pytorch():
     assert said[0] == said[2] == [] and len(said[1]) == 1 and "kernel 'own'" in said[1][0]
     single = Layer(RBF(), *(tensor.float() for tensor in layer.parameters().values()))
     assert layer_terms(single).compiled is None
-    assert layer_terms(layer._replace(kernel=RBF(), log_slope=layer.log_lengthscale)).compiled is None
 
 
 @needs_compiler
