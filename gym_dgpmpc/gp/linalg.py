@@ -15,6 +15,10 @@ JITTER = 1e-6
 _LADDER = (1.0, 10.0, 100.0, 1e3, 1e4)
 
 
+Factorise = Callable[[Tensor, Any], tuple[Tensor, bool]]
+"""From symmetric matrices, and what is to be added to their diagonals, to lower factors, and whether there are any."""
+
+
 def by_lapack(covariance: Float[Tensor, "*b n n"], added: float | Tensor) -> tuple[Float[Tensor, "*b n n"], bool]:
     """The factor of ``covariance + added * I``, and whether there is one."""
     eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
@@ -27,7 +31,7 @@ def cholesky(
     covariance: Float[Tensor, "*b n n"],
     scale: float | Float[Tensor, ""] | Float[Tensor, "*b 1 1"] = 1.0,
     jitter: float = JITTER,
-    factorise: Callable[[Tensor, Any], tuple[Tensor, bool]] = by_lapack,
+    factorise: Factorise = by_lapack,
 ) -> Float[Tensor, "*b n n"]:
     """Lower Cholesky factor of ``covariance + jitter * scale * I``, differentiable.
 
@@ -36,7 +40,7 @@ def cholesky(
     Args:
         covariance: symmetric and positive semi-definite up to rounding.
         scale: the kernel's variance, which the jitter is relative to; of all matrices, or of each.
-        factorise: gives the factor with so much added to the diagonal, and whether there is one.
+        factorise: what gives the factor.
 
     Raises:
         FactorisationError: the matrix is not finite, or not positive definite with the largest jitter.

@@ -30,6 +30,7 @@ class _Layer(ctypes.Structure):
         ("lengthscale", _Doubles),
         ("variance", _Doubles),
         ("centres", _Doubles),
+        ("linear", _Doubles),
         ("own_slope", _Doubles),
         ("inverse", _Doubles),
     )
@@ -52,15 +53,15 @@ class _Points(ctypes.Structure):
         ("inducing_bar", _Doubles),
         ("log_lengthscale_bar", _Doubles),
         ("log_variance_bar", _Doubles),
+        ("log_slope_bar", _Doubles),
     )
 
 
 _ARGUMENTS = {
     "own_correlations": (_Doubles, _Doubles),
-    "factorise": (_Doubles, ctypes.c_double, _Doubles),
     "invert": (_Doubles, _Doubles),
     "see": (_Count, _Doubles, _Count, _Doubles, _Doubles, _Doubles),
-    "moments": (_Count, _Doubles, _Count, _Doubles, ctypes.c_double, _Doubles, _Doubles),
+    "moments": (_Count, _Doubles, _Count, _Doubles, _Doubles, ctypes.c_double, _Doubles, _Doubles),
     "back": (ctypes.POINTER(_Points),),
     "gram": (_Count, _Doubles, _Count, _Doubles, _Doubles),
     "copy": (_Count, _Doubles, _Doubles, _Doubles),
@@ -91,6 +92,7 @@ class CompiledLayer:
         kernel: of all chains.
         lengthscale, variance: of each.
         centres: inducing inputs over the lengthscales.
+        linear: variances of the slopes of the kernel's linear part, if it has one.
 
     Raises:
         MemoryError: by most methods, where some hundred kilobytes a thread could not be allocated.
@@ -102,9 +104,12 @@ class CompiledLayer:
         lengthscale: Float[Tensor, "C D"],
         variance: Float[Tensor, "C"],
         centres: Float[Tensor, "C M D"],
+        linear: Float[Tensor, "C D"] | None = None,
     ):
         self._chains, self._size, self._inputs = centres.shape
-        self._kept_alive = [tensor.contiguous() for tensor in (lengthscale, variance, centres)]
+        self._is_linear = linear is not None
+        given = (lengthscale, variance, centres) if linear is None else (lengthscale, variance, centres, linear)
+        self._kept_alive = [tensor.contiguous() for tensor in given]
         pointers = (tensor.data_ptr() for tensor in self._kept_alive)
         self._layer = _Layer(_kernel_number(kernel), self._size, self._inputs, *pointers)
 
@@ -116,16 +121,10 @@ class CompiledLayer:
         self._layer.own_slope = slope.data_ptr()
         return value, slope
 
-    def factorise(self, correlations: Float[Tensor, "C M M"], jitter: float) -> tuple[Float[Tensor, "C M M"], bool]:
-        """L of `own_correlations` and the jitter; and whether there is one."""
-        upper = self._large(self._size)
-        failed = self._failures("factorise", correlations.data_ptr(), jitter, upper.data_ptr())
-        return upper.mT, not failed
-
     def invert(self, factor: Float[Tensor, "C M M"]) -> Float[Tensor, "C M M"]:
-        """L^-1, of a factor that `factorise` gave; it is kept for all that follows."""
-        inverses = self._large(self._size, 2)
-        self._call("invert", factor.data_ptr(), inverses.data_ptr())
+        """L^-1 of what `factorise` gives; it is kept for all that follows."""
+        upper, inverses = self._in_place(factor.mT), self._large(self._size, 2)
+        self._call("invert", upper.data_ptr(), inverses.data_ptr())
         self._kept_alive.append(inverses)
         self._layer.inverse = inverses.data_ptr()
         return inverses[:, 0]
@@ -142,15 +141,19 @@ class CompiledLayer:
         return scaled, projected.mT, slope
 
     def moments(
-        self, whitened: Float[Tensor, "C M O"], projected: Float[Tensor, "C M n"], least: float
+        self,
+        whitened: Float[Tensor, "C M O"],
+        scaled: Float[Tensor, "C n D"],
+        projected: Float[Tensor, "C M n"],
+        least: float,
     ) -> tuple[Float[Tensor, "C n O"], Float[Tensor, "C n"]]:
         """Mean and variance of `layers.Passed`."""
-        whitened, by_point = whitened.contiguous(), self._in_place(projected.mT)
+        whitened, scaled, by_point = whitened.contiguous(), scaled.contiguous(), self._in_place(projected.mT)
         num_points, outputs = by_point.shape[1], whitened.shape[2]
         mean, variance = self._new(num_points, outputs), self._new(num_points)
         self._call(
-            "moments", outputs, whitened.data_ptr(), num_points, by_point.data_ptr(), least, mean.data_ptr(),
-            variance.data_ptr(),
+            "moments", outputs, whitened.data_ptr(), num_points, scaled.data_ptr(), by_point.data_ptr(), least,
+            mean.data_ptr(), variance.data_ptr(),
         )  # fmt: skip
         return mean, variance
 
@@ -173,7 +176,8 @@ class CompiledLayer:
         )  # fmt: skip
         whitened_bar = self._new(self._size, outputs)
         points_bar = self._new(num_points, self._inputs) if of_points else None
-        shapes = ((self._size, self._inputs), (self._inputs,), ()) if of_parameters else ()
+        slopes = [(self._inputs,)] if self._is_linear else []
+        shapes = [(self._size, self._inputs), (self._inputs,), (), *slopes] if of_parameters else []
         parameters_bar = [self._new(*shape) for shape in shapes]
         pointers = [tensor.data_ptr() for tensor in (*given, whitened_bar)]
         pointers.append(0 if points_bar is None else points_bar.data_ptr())
@@ -213,14 +217,27 @@ class CompiledLayer:
         return copied.copy_(large)
 
     def _call(self, name: str, *arguments: object) -> None:
-        if self._failures(name, *arguments):
+        if _in_shares(self._chains, name, self._layer, *arguments):
             raise MemoryError("could not allocate the scratch space of a layer, some hundred kilobytes a thread")
 
-    def _failures(self, name: str, *arguments: object) -> int:
-        function: Callable[..., int] = getattr(_library(), name)
-        share = -(-self._chains // torch.get_num_threads())
-        ranges = [(first, min(first + share, self._chains)) for first in range(0, self._chains, share)]
-        return compiler.in_threads(lambda first, last: function(self._layer, *arguments, first, last), ranges)
+
+def factorise(covariance: Float[Tensor, "*b M M"], added: float) -> tuple[Float[Tensor, "*b M M"], bool]:
+    """`linalg.by_lapack` for float64 on the CPU, where there is compiled code; without a gradient."""
+    given = covariance if covariance.stride()[-1] == 1 else covariance.contiguous()
+    given = given.flatten(0, -3) if given.ndim > 3 else given
+    count, _, size = given.shape
+    upper = given.new_empty(count, _padded(size), _padded(size))
+    places = given.data_ptr(), given.stride(0), given.stride(1)
+    failed = _in_shares(count, "factorise", size, *places, added, upper.data_ptr())
+    return upper[:, :size, :size].unflatten(0, covariance.shape[:-2]).mT, not failed
+
+
+def _in_shares(count: int, name: str, *arguments: object) -> int:
+    """Call a function for so many chains, or matrices, each thread for a share of them; the sum of what it returns."""
+    function: Callable[..., int] = getattr(_library(), name)
+    share = -(-count // torch.get_num_threads())
+    ranges = [(first, min(first + share, count)) for first in range(0, count, share)]
+    return compiler.in_threads(lambda first, last: function(*arguments, first, last), ranges)
 
 
 @cache
@@ -228,11 +245,11 @@ def _library() -> ctypes.CDLL | None:
     library = compiler.load(SOURCE)
     if library is not None:
         for name, arguments in _ARGUMENTS.items():
-            function = getattr(library, name)
-            function.argtypes = (ctypes.POINTER(_Layer), *arguments, _Count, _Count)
-            function.restype = _Count
+            getattr(library, name).argtypes = (ctypes.POINTER(_Layer), *arguments, _Count, _Count)
+        library.factorise.argtypes = (_Count, _Doubles, _Count, _Count, ctypes.c_double, _Doubles, _Count, _Count)
         library.kernel_number.argtypes = (ctypes.c_char_p,)
-        library.kernel_number.restype = library.unit.restype = _Count
+        for name in (*_ARGUMENTS, "factorise", "kernel_number", "unit"):
+            getattr(library, name).restype = _Count
     return library
 
 

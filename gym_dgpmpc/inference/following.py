@@ -88,7 +88,7 @@ class Follower:
         evidence = total
         if whole < data.num_rows:
             evidence = total.plus(self._evidence(rows, recent, whole - begin, data.num_rows - begin))
-        positions = evidence.posterior().positions(self._inner, num_samples, generator)
+        positions = evidence.posterior(self._prepared.factorise).positions(self._inner, num_samples, generator)
         self._sum, self._num_summed = total, whole
         return Followed(positions, grown, rows.y)
 

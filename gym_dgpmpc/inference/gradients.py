@@ -19,6 +19,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, log_likelihood
+from gym_dgpmpc.gp.linalg import Factorise, by_lapack
+from gym_dgpmpc.inference import compiled_layers
 from gym_dgpmpc.inference.layers import LayerTerms, Passed, Seen, layer_gradients, layer_terms, moments, see
 
 LEAST_VARIANCE = 1e-12
@@ -30,6 +32,11 @@ class Prepared(NamedTuple):
 
     model: DeepGP
     layers: list[LayerTerms]
+
+    @property
+    def factorise(self) -> Factorise:
+        """How matrices of such models are factorised."""
+        return by_lapack if self.layers[0].compiled is None else compiled_layers.factorise
 
     @property
     def factorised(self) -> Factorised:
@@ -78,7 +85,7 @@ def forward(
     layers = prepared.layers
     passed = [first or pass_first(prepared, whitened[0], see(layers[0], x))]
     for index, (layer, v) in enumerate(zip(layers[1:], whitened[1:], strict=True), 1):
-        x = x + passed[-1].mean + passed[-1].variance.sqrt().unsqueeze(-1) * latents[index - 1]
+        x = torch.addcmul(x + passed[-1].mean, passed[-1].variance.sqrt().unsqueeze(-1), latents[index - 1])
         passed.append(moments(layer, v, see(layer, x), 0.0 if index == len(layers) - 1 else LEAST_VARIANCE))
     return passed
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gym_dgpmpc.errors import FactorisationError
-from gym_dgpmpc.gp.linalg import cholesky
+from gym_dgpmpc.gp.linalg import Factorise, by_lapack, cholesky
 from gym_dgpmpc.inference.gradients import Prepared
 from gym_dgpmpc.inference.layers import Passed, gram
 
@@ -50,7 +50,7 @@ class LastLayerEvidence(NamedTuple):
         """Of both data."""
         return LastLayerEvidence(self.precision + other.precision, self.moment + other.moment)
 
-    def posterior(self) -> LastLayerPosterior:
+    def posterior(self, factorise: Factorise = by_lapack) -> LastLayerPosterior:
         """With the standard normal prior.
 
         Raises:
@@ -59,7 +59,7 @@ class LastLayerEvidence(NamedTuple):
         """
         prior = torch.eye(self.moment.shape[-1], dtype=self.moment.dtype, device=self.moment.device)
         # No eigenvalue lies below the prior's one, so no jitter is needed.
-        factor = cholesky(self.precision + prior, self.moment.new_ones(()), jitter=0.0)
+        factor = cholesky(self.precision + prior, jitter=0.0, factorise=factorise)
         mean = torch.cholesky_solve(self.moment.unsqueeze(-1), factor).squeeze(-1)
         if not bool(mean.isfinite().all()):  # targets are in the moment alone
             raise FactorisationError(

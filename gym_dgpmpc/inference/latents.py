@@ -13,6 +13,7 @@ from torch import Tensor
 from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.inference.gradients import Prepared, forward, likelihood, pass_first
 from gym_dgpmpc.inference.layers import Passed, choose, see
+from gym_dgpmpc.randomness import quick_normals
 
 PROPOSALS = (0.0, 0.9, 0.99)
 """Correlations of a proposed latent with the present one: far, near and nearer, for data that say little or much."""
@@ -53,8 +54,8 @@ def move_latents(
     correlation = PROPOSALS[int(torch.randint(len(PROPOSALS), (1,), generator=generator, device=generator.device))]
     proposed = []
     for latent in latents:
-        fresh = torch.randn(latent.shape, generator=generator, dtype=latent.dtype, device=latent.device)
-        proposed.append(correlation * latent + math.sqrt(1.0 - correlation**2) * fresh)
+        fresh = quick_normals(latent.shape, latent, generator)
+        proposed.append(fresh.mul_(math.sqrt(1.0 - correlation**2)).add_(latent, alpha=correlation))
     ways = [forward(prepared, whitened, x, each, first) for each in (latents, proposed)]
     present, other = (likelihood(prepared, way, batch.y) for way in ways)
     uniform = torch.rand(present.shape, generator=generator, dtype=present.dtype, device=present.device)

@@ -70,24 +70,24 @@ def layer_terms(layer: Layer, *, compile: bool = True) -> LayerTerms:
     Raises:
         FactorisationError: see `linalg.cholesky`.
     """
-    lengthscale, variance = layer.lengthscale, layer.variance
+    lengthscale, variance, linear = layer.lengthscale, layer.variance, layer.slope_variance
     centres = layer.inducing_inputs / lengthscale.unsqueeze(-2)
     compiled = None
-    if compile and layer.slope_variance is None and compiled_layers.can_take(layer.kernel, centres):
-        compiled = CompiledLayer(layer.kernel, lengthscale, variance, centres)
+    if compile and compiled_layers.can_take(layer.kernel, centres):
+        compiled = CompiledLayer(layer.kernel, lengthscale, variance, centres, linear)
         correlations, own_slope = compiled.own_correlations()
-        factor = cholesky(correlations, factorise=compiled.factorise)
+        factor = cholesky(correlations, factorise=compiled_layers.factorise)
         inverse = compiled.invert(factor)
     else:
         correlations, own_slope = layer.kernel.correlation_and_slope(sqdist(centres, centres))
-        if layer.slope_variance is not None:
-            correlations = correlations + linear_covariance(centres, centres, layer.slope_variance)
+        if linear is not None:
+            correlations = correlations + linear_covariance(centres, centres, linear)
         factor = cholesky(correlations)
         eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
         inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
     return LayerTerms(
-        layer.kernel, lengthscale.unsqueeze(-2), variance[:, None, None], centres, factor, inverse, own_slope,
-        layer.slope_variance, compiled,
+        layer.kernel, lengthscale.unsqueeze(-2), variance[:, None, None], centres, factor, inverse, own_slope, linear,
+        compiled,
     )  # fmt: skip
 
 
@@ -105,7 +105,7 @@ def see(terms: LayerTerms, x: Float[Tensor, "C n D"]) -> Seen:
 def moments(terms: LayerTerms, whitened: Float[Tensor, "C M O"], seen: Seen, least: float) -> Passed:
     """Conditional mean and variance, the latter not below ``least``."""
     if terms.compiled is not None:
-        return Passed(seen, *terms.compiled.moments(whitened, seen.projected, least))
+        return Passed(seen, *terms.compiled.moments(whitened, seen.scaled, seen.projected, least))
     mean = terms.variance.sqrt() * (seen.projected.mT @ whitened)
     own = 1.0 if terms.linear is None else 1.0 + (seen.scaled.square() * terms.linear.unsqueeze(-2)).sum(-1)
     variance = terms.variance.squeeze(-1) * (own - seen.projected.square().sum(-2))

@@ -33,6 +33,7 @@ from gym_dgpmpc.inference.layers import Passed, Seen, see
 from gym_dgpmpc.inference.priors import log_prior_gradient
 from gym_dgpmpc.inference.settings import InferenceSettings
 from gym_dgpmpc.inference.sghmc import SGHMCState
+from gym_dgpmpc.randomness import quick_normals
 
 LAST_LEARNING_RATE = 1 / 6
 """Adam's learning rate at the end of its iterations, as a share of that at their start; it falls geometrically."""
@@ -169,8 +170,7 @@ class Chains:
         """Draw the last layer's inducing outputs exactly, given all else, and a momentum from its own law."""
         whitened, inner, num_data = self.state.whitened, self.model.num_inner(), self.data.num_rows
         size = self._step_sizes(whitened, self.settings.step_size, min(self.settings.batch_size, num_data))
-        noise = torch.randn(size.shape, generator=generator, dtype=size.dtype, device=size.device)
-        momentum = noise * size * (whitened.inverse_mass() / num_data).sqrt()
+        momentum = quick_normals(size.shape, size, generator) * size * (whitened.inverse_mass() / num_data).sqrt()
         momentum[:, :inner] = whitened.momentum[:, :inner]
         position = self.last_layer_draws(1, generator)[0]
         self.state = self.state._replace(whitened=whitened._replace(position=position, momentum=momentum))
@@ -185,7 +185,7 @@ class Chains:
         passed, _ = self._pass(position, batch, index, generator, move=False)
         weight = self.data.num_rows / batch.num_rows
         evidence = last_layer_evidence(self.prepared, passed[-1], batch.y, weight)
-        return evidence.posterior().positions(position[:, :inner], num_samples, generator)
+        return evidence.posterior(self.prepared.factorise).positions(position[:, :inner], num_samples, generator)
 
     def _batch(self, size: int, generator: torch.Generator) -> tuple[Data, Int[Tensor, "n"] | None]:
         """Rows of the data, drawn uniformly with replacement, and which they are; None stands for all of them."""
@@ -208,7 +208,7 @@ class Chains:
     ) -> tuple[list[Passed], list[Tensor]]:
         """The rows through all layers with their latents, which are moved before if ``move`` says so."""
         whitened = self.model.split(position)
-        latents = [latent if index is None else latent[:, index] for latent in self.state.latents]
+        latents = [latent if index is None else latent.index_select(1, index) for latent in self.state.latents]
         x = batch.x.expand(len(position), -1, -1)
         if index is not None:
             seen = see(self.prepared.layers[0], x)
@@ -223,7 +223,7 @@ class Chains:
             if index is None:
                 held.copy_(moved)
             else:
-                held[:, index] = moved
+                held.index_copy_(1, index, moved)
         return passed, latents
 
     def _gradients(

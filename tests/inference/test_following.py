@@ -67,8 +67,8 @@ def posteriors(monkeypatch):
     """Every posterior that is drawn from."""
     seen, original = [], LastLayerEvidence.posterior
 
-    def watched(self):
-        seen.append(original(self))
+    def watched(self, *args):
+        seen.append(original(self, *args))
         return seen[-1]
 
     monkeypatch.setattr(LastLayerEvidence, "posterior", watched)

@@ -21,7 +21,7 @@ def problem(num_layers, kernel="matern32", num_points=17, *, linear=False):
     return model, whitened, normal(generator, num_points, 3), normal(generator, num_points, 2), latents
 
 
-@pytest.mark.parametrize(("compile", "linear"), [(True, False), (False, False), (True, True)])
+@pytest.mark.parametrize(("compile", "linear"), [(True, False), (False, False), (True, True), (False, True)])
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("num_layers", [1, 2, 3])
 def test_automatic_differentiation_agrees(num_layers, kernel, compile, linear):

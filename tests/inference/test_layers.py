@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from gym_dgpmpc import compiler
+from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.kernels import KERNELS, RBF
 from gym_dgpmpc.gp.layer import Layer
+from gym_dgpmpc.gp.linalg import cholesky
 from gym_dgpmpc.inference import compiled_layers, layers
 from gym_dgpmpc.inference.layers import Seen, gram, layer_gradients, layer_terms, moments, see
 from tests.oracles.models import normal, seeded
@@ -29,7 +31,7 @@ needs_compiler = pytest.mark.skipif(
 class Problem:
     """A layer of chains that differ, points, and gradients of their moments."""
 
-    def __init__(self, kernel="matern32", sizes=SIZES[1], nudge=0.0):
+    def __init__(self, kernel="matern32", sizes=SIZES[1], nudge=0.0, *, linear=False):
         chains, num_points, num_inducing, inputs, outputs = sizes
         generator, other = seeded(3), seeded(4)
 
@@ -37,7 +39,9 @@ class Problem:
             return normal(generator, *shape) * (1.0 + nudge * normal(other, *shape))
 
         log_lengthscale = math.log(math.sqrt(inputs)) + 0.2 * draw(chains, inputs)
-        self.layer = Layer(KERNELS[kernel], draw(chains, num_inducing, inputs), log_lengthscale, 0.5 * draw(chains))
+        log_slope = draw(chains, inputs) - 0.5 if linear else None
+        centres, log_variance = draw(chains, num_inducing, inputs), 0.5 * draw(chains)
+        self.layer = Layer(KERNELS[kernel], centres, log_lengthscale, log_variance, log_slope)
         self.terms = layer_terms(self.layer)
         self.points, self.whitened = draw(chains, num_points, inputs), draw(chains, num_inducing, outputs)
         self.mean_bar, self.variance_bar = draw(chains, num_points, outputs), draw(chains, num_points)
@@ -62,11 +66,11 @@ class Problem:
 
 @needs_compiler
 @pytest.mark.parametrize("sizes", SIZES)
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_compiled_layers_are_pytorchs(kernel, sizes):
-    problem = Problem(kernel, sizes)
+@pytest.mark.parametrize(("kernel", "linear"), [*((kernel, False) for kernel in KERNELS), ("matern32", True)])
+def test_compiled_layers_are_pytorchs(kernel, linear, sizes):
+    problem = Problem(kernel, sizes, linear=linear)
     found, expected = problem.numbers(compile=True), problem.numbers(compile=False)
-    nudged = Problem(kernel, sizes, NUDGE).numbers(compile=False)
+    nudged = Problem(kernel, sizes, NUDGE, linear=linear).numbers(compile=False)
     # Where a centre meets itself its own slope cancels, that of Matern-1/2 a million times larger than others.
     steepest = 1.0 + float(problem.terms.own_slope.abs().max())
     cancelling = dict.fromkeys(("inducing_inputs_bar", "log_lengthscale_bar"), steepest)
@@ -75,6 +79,34 @@ def test_compiled_layers_are_pytorchs(kernel, sizes):
         allowed = AS_FAR * rounding + 16 * 2**-53 * largest * cancelling.get(name, 1.0)
         assert allowed <= 1e-8 * largest, name
         assert float((found[name] - value).abs().max()) <= allowed, name
+
+
+@needs_compiler
+@pytest.mark.parametrize("size", [1, 7, 8, 33, 104])
+def test_compiled_factors_are_lapacks(size):
+    """Of matrices in any memory; to the rounding of a Cholesky factorisation, M eps times the matrix (Higham 2002)."""
+    root = normal(seeded(), 3, 2, size, size)
+    matrices = root @ root.mT
+    strided = torch.nn.functional.pad(matrices, (0, 5))[..., :size]
+    for given, added in ((matrices, 0.1), (strided, 0.1), (matrices.mT, 2.0)):
+        factor, exists = compiled_layers.factorise(given, added)
+        assert exists and factor.shape == matrices.shape
+        assert not factor.triu(1).any() and (factor.diagonal(dim1=-2, dim2=-1) > 0).all()
+        rounding = (size + 1) * 2**-52 * float(matrices.diagonal(dim1=-2, dim2=-1).max() + added)
+        expected = matrices + added * torch.eye(size).double()
+        torch.testing.assert_close(factor @ factor.mT, expected, rtol=0, atol=rounding)
+
+
+@needs_compiler
+@pytest.mark.parametrize("value", [-1e-3, math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("place", [0, 6, 19])
+def test_a_matrix_that_has_no_factor_is_told(place, value):
+    matrices = torch.eye(20).double().repeat(4, 1, 1)
+    assert compiled_layers.factorise(matrices, 0.0)[1]
+    matrices[2, place, place] = value
+    assert not compiled_layers.factorise(matrices, 0.0)[1]
+    with pytest.raises(FactorisationError, match="jitter" if value == -1e-3 else "finite"):
+        cholesky(matrices, jitter=1e-8, factorise=compiled_layers.factorise)
 
 
 @needs_compiler
@@ -87,8 +119,9 @@ def test_variances_have_a_bound():
 
 
 @needs_compiler
-def test_only_what_is_wanted_is_computed():
-    problem = Problem()
+@pytest.mark.parametrize("linear", [False, True])
+def test_only_what_is_wanted_is_computed(linear):
+    problem = Problem(linear=linear)
     seen = see(problem.terms, problem.points)
     passed = moments(problem.terms, problem.whitened, seen, 0.0)
     given = problem.terms, problem.whitened, passed, problem.mean_bar, problem.variance_bar
@@ -193,7 +226,6 @@ def test_what_the_compiled_code_does_not_have_is_left_to_pytorch():
     assert said[0] == said[2] == [] and len(said[1]) == 1 and "kernel 'own'" in said[1][0]
     single = Layer(RBF(), *(tensor.float() for tensor in layer.parameters().values()))
     assert layer_terms(single).compiled is None
-    assert layer_terms(layer._replace(kernel=RBF(), log_slope=layer.log_lengthscale)).compiled is None
 
 
 @needs_compiler

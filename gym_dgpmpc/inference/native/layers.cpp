@@ -42,6 +42,7 @@ struct Layer {
   const double *lengthscale;         // [C, D]
   const double *variance;            // [C]
   const double *centres;             // [C, M, D], over the lengthscales
+  const double *linear;              // [C, D], variances of the slopes of a linear part, or null
   const double *own_slope;           // [C, M', M'], from `own_correlations`
   const double *inverse;             // [C, 2, M', M'], from `invert`: lower triangular, and its transpose
 };
@@ -51,6 +52,8 @@ namespace {
 
 inline vec all(double value) { return vec{} + value; }
 inline int64_t rounded_up(int64_t size, int64_t unit) { return (size + unit - 1) / unit * unit; }
+inline int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
+inline int64_t larger(int64_t a, int64_t b) { return a > b ? a : b; }
 inline int64_t padded(int64_t size) { return rounded_up(size, ROWS); }
 inline vec &at(double *values) { return *(vec *)values; }
 inline const vec &at(const double *values) { return *(const vec *)values; }
@@ -182,17 +185,40 @@ struct Matrix {
   View transposed() const { return {values, 1, width}; }
 };
 
-// c += a b, or c = a b if not ADD, over k = begin..end-1, for ROWS rows and some vectors of columns, which stay in
-// registers.
+struct Range {
+  int64_t begin, end;
+};
+
+// c += a b, or c = a b if not ADD, for ROWS rows and some vectors of columns, which stay in registers. Each vector has
+// the k of its own that count; they share those from the latest beginning to the earliest end.
 template <bool ADD, int COUNT>
-inline void tile(View a, Matrix b, Matrix c, int64_t i, int64_t j, int64_t begin, int64_t end) {
+inline void tile(View a, Matrix b, Matrix c, int64_t i, int64_t j, const Range *ranges) {
   vec sum[ROWS][COUNT];
 #pragma GCC unroll 8
   for (int r = 0; r < ROWS; r++)
 #pragma GCC unroll 3
     for (int v = 0; v < COUNT; v++) sum[r][v] = ADD ? at(c.row(i + r) + j + v * LANES) : vec{};
-  const double *left = a.values + i * a.row + begin * a.column;
-  for (int64_t k = begin; k < end; k++, left += a.column) {
+  Range shared = ranges[0];
+#pragma GCC unroll 3
+  for (int v = 1; v < COUNT; v++)
+    shared = {larger(shared.begin, ranges[v].begin), smaller(shared.end, ranges[v].end)};
+  if (shared.end < shared.begin) shared.end = shared.begin;
+#pragma GCC unroll 3
+  for (int v = 0; v < COUNT; v++) {
+    const Range range = ranges[v];
+    const Range parts[2] = {{range.begin, smaller(shared.begin, range.end)}, {larger(shared.end, range.begin), range.end}};
+#pragma GCC unroll 2
+    for (const Range part : parts) {
+      const double *left = a.values + i * a.row + part.begin * a.column;
+      for (int64_t k = part.begin; k < part.end; k++, left += a.column) {
+        const vec right = at(b.row(k) + j + v * LANES);
+#pragma GCC unroll 8
+        for (int r = 0; r < ROWS; r++) sum[r][v] += left[r * a.row] * right;
+      }
+    }
+  }
+  const double *left = a.values + i * a.row + shared.begin * a.column;
+  for (int64_t k = shared.begin; k < shared.end; k++, left += a.column) {
     vec right[COUNT];
 #pragma GCC unroll 3
     for (int v = 0; v < COUNT; v++) right[v] = at(b.row(k) + j + v * LANES);
@@ -207,31 +233,28 @@ inline void tile(View a, Matrix b, Matrix c, int64_t i, int64_t j, int64_t begin
     for (int v = 0; v < COUNT; v++) at(c.row(i + r) + j + v * LANES) = sum[r][v];
 }
 
-struct Range {
-  int64_t begin, end;
-};
-
-// The product for rows first..last-1 and all columns of c; `ranges(i, j)` says which k count for the rows from i and
-// the columns from j on, where j is the first and `j + VECTORS * LANES` beyond the last of a block. Where none do c
-// stays. Columns are outside: theirs of b stay in the nearest cache.
+// The product for rows first..last-1 and all columns of c; `ranges(i, j)` says which k count for ROWS rows from i and a
+// vector of columns from j on. Columns are outside: theirs of b stay in the nearest cache.
 template <bool ADD = true, class Ranges>
 void product(View a, Matrix b, Matrix c, int64_t first, int64_t last, Ranges ranges) {
   for (int64_t j = 0; j < c.width; j += VECTORS * LANES)
     for (int64_t i = first; i < last; i += ROWS) {
-      const Range range = ranges(i, j);
-      if (range.begin >= range.end) continue;
-      if (c.width - j >= VECTORS * LANES)
-        tile<ADD, VECTORS>(a, b, c, i, j, range.begin, range.end);
-      else if (c.width - j >= 2 * LANES)
-        tile<ADD, 2>(a, b, c, i, j, range.begin, range.end);
-      else
-        tile<ADD, 1>(a, b, c, i, j, range.begin, range.end);
+      Range each[VECTORS];
+      int count = 0;  // without the last vectors for which no k counts
+      for (int v = 0; v < VECTORS && j + v * LANES < c.width; v++) {
+        each[v] = ranges(i, j + v * LANES);
+        if (each[v].begin < each[v].end) count = v + 1;
+      }
+      if (count == 3)
+        tile<ADD, 3>(a, b, c, i, j, each);
+      else if (count == 2)
+        tile<ADD, 2>(a, b, c, i, j, each);
+      else if (count == 1)
+        tile<ADD, 1>(a, b, c, i, j, each);
     }
 }
 
 inline Range every(int64_t count) { return {0, count}; }
-inline int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
-inline int64_t larger(int64_t a, int64_t b) { return a > b ? a : b; }
 
 // One of the caller's large matrices, of which there are some one after the other.
 inline Matrix given(const double *values, int64_t rows, int64_t columns, int64_t index) {
@@ -286,7 +309,7 @@ int64_t with_memory(const Layer &layer, int64_t outputs, Body body) {
 // What one chain has of a layer.
 struct Own {
   int64_t size, inputs;  // M, D
-  const double *lengthscale, *centres;
+  const double *lengthscale, *centres, *linear;
   double variance;
   Matrix slope, inverse, transposed;
   Own(const Layer &layer, int64_t chain)
@@ -294,6 +317,7 @@ struct Own {
         inputs(layer.input_size),
         lengthscale(layer.lengthscale + chain * inputs),
         centres(layer.centres + chain * size * inputs),
+        linear(layer.linear ? layer.linear + chain * inputs : nullptr),
         variance(layer.variance[chain]),
         slope(given(layer.own_slope, size, size, chain)),
         inverse(given(layer.inverse, size, size, 2 * chain)),
@@ -319,7 +343,7 @@ void read_centres(const Own &own, const CorrelationBuffers &use) {
       at(use.lengths.values + j) += at(use.centres.row(d) + j) * at(use.centres.row(d) + j);
 }
 
-// Of some points, over the lengthscales; r^2 = |x|^2 + |z|^2 - 2 x.z.
+// Of some points, over the lengthscales; r^2 = |x|^2 + |z|^2 - 2 x.z. A linear part is added to the values.
 void correlate(const Layer &layer, const Own &own, const double *scaled, int64_t count, Matrix values, double *slopes,
                const CorrelationBuffers &use) {
   const int64_t rows = padded(count), inputs = own.inputs;
@@ -335,21 +359,25 @@ void correlate(const Layer &layer, const Own &own, const double *scaled, int64_t
   }
   product(use.points.view(), use.centres, values, 0, rows, [=](int64_t, int64_t) { return every(inputs); });
   KERNELS::entries[layer.kernel].evaluate(values.values, slopes, rows * values.width);
+  if (!own.linear) return;
+  for (int64_t i = 0; i < rows; i++)
+    for (int64_t d = 0; d < inputs; d++) use.points.row(i)[d] *= -0.5 * own.linear[d];
+  product(use.points.view(), use.centres, values, 0, rows, [=](int64_t, int64_t) { return every(inputs); });
 }
 
 // Upper triangular U = L^T with U^T U = m + jitter, row by row of blocks: what the rows above say of a block of rows,
 // then these one after the other. Returns whether it exists.
-bool factorise_chain(int64_t size, Matrix m, double jitter, Matrix upper) {
+bool factorise_one(int64_t size, const double *m, int64_t row_of_m, double jitter, Matrix upper) {
   clear(upper, padded(size));
   bool exists = true;
   for (int64_t first = 0; first < size; first += ROWS) {
     const int64_t end = smaller(first + ROWS, size);
     for (int64_t i = first; i < end; i++) {
-      for (int64_t j = i; j < size; j++) upper.row(i)[j] = -m.row(i)[j];
+      for (int64_t j = i; j < size; j++) upper.row(i)[j] = -m[i * row_of_m + j];
       upper.row(i)[i] -= jitter;
     }
     product(upper.transposed(), upper, upper, first, first + ROWS,
-            [=](int64_t, int64_t j) { return j + VECTORS * LANES > first ? every(first) : Range{0, 0}; });
+            [=](int64_t, int64_t j) { return j + LANES > first ? every(first) : Range{0, 0}; });
     for (int64_t i = first; i < end; i++) {
       double *row = upper.row(i);
       for (int64_t k = first; k < i; k++)
@@ -407,7 +435,7 @@ void see_chain(const Layer &layer, const Own &own, const double *x, int64_t num_
     const int64_t count = smaller(num_points - p, POINTS);
     correlate(layer, own, scaled + p * inputs, count, use.values, slope.row(p), use.correlations);
     product<false>(use.values.view(), own.transposed, {projected.row(p), projected.width}, 0, padded(count),
-                   [=](int64_t, int64_t j) { return every(smaller(j + VECTORS * LANES, size)); });
+                   [=](int64_t, int64_t j) { return every(smaller(j + LANES, size)); });
   }
 }
 
@@ -417,8 +445,15 @@ struct MomentBuffers {
       : whitened(memory.matrix(layer.num_inducing, outputs)), mean(memory.matrix(POINTS, outputs)) {}
 };
 
-void moments_chain(const Own &own, int64_t outputs, const double *whitened, int64_t num_points, Matrix projected,
-                   double least, double *mean, double *variance, const MomentBuffers &use) {
+// k(x, x) over the variance.
+inline double own_variance(const Own &own, const double *scaled) {
+  double sum = 1.0;
+  for (int64_t d = 0; own.linear && d < own.inputs; d++) sum += own.linear[d] * scaled[d] * scaled[d];
+  return sum;
+}
+
+void moments_chain(const Own &own, int64_t outputs, const double *whitened, int64_t num_points, const double *scaled,
+                   Matrix projected, double least, double *mean, double *variance, const MomentBuffers &use) {
   const int64_t size = own.size;
   const double deviation = sqrt(own.variance);
   read(use.whitened, whitened, size, outputs, padded(size));
@@ -434,7 +469,7 @@ void moments_chain(const Own &own, int64_t outputs, const double *whitened, int6
         sum += at(projected.row(p + i) + j) * at(projected.row(p + i) + j);
       double known = 0.0;
       for (int j = 0; j < LANES; j++) known += sum[j];
-      const double left = own.variance * (1.0 - known);
+      const double left = own.variance * (own_variance(own, scaled + (p + i) * own.inputs) - known);
       variance[p + i] = left < least ? least : left;
     }
   }
@@ -461,11 +496,12 @@ struct Points {
   double *inducing_bar;        // [C, M, D], or null, and with it the next two
   double *log_lengthscale_bar; // [C, D]
   double *log_variance_bar;    // [C]
+  double *log_slope_bar;       // [C, D], or null without a linear part
 };
 
 struct BackBuffers {
   Matrix centres, whitened, mean_bar, bar, by_distance, points, moved;
-  Matrix whitened_bar, lower, left, both, own, by_centre;
+  Matrix whitened_bar, lower, left, both, own, by_centre, along, seen_from, seen_own;
   BackBuffers(Memory &memory, const Layer &layer, int64_t outputs)
       : centres(memory.matrix(layer.num_inducing, layer.input_size + 1)),
         whitened(memory.matrix(outputs, layer.num_inducing)),
@@ -479,7 +515,10 @@ struct BackBuffers {
         left(memory.matrix(layer.num_inducing, layer.num_inducing)),
         both(memory.matrix(layer.num_inducing, layer.num_inducing)),
         own(memory.matrix(layer.num_inducing, layer.input_size + 1)),
-        by_centre(memory.matrix(layer.input_size + 1, layer.num_inducing)) {}
+        by_centre(memory.matrix(layer.input_size + 1, layer.num_inducing)),
+        along(memory.matrix(POINTS, layer.input_size + 1)),
+        seen_from(memory.matrix(layer.input_size + 1, layer.num_inducing)),
+        seen_own(memory.matrix(layer.num_inducing, layer.input_size + 1)) {}
 };
 
 // Rows of the caller, with a last column of ones: with it the sums over a product's terms come with the product.
@@ -489,9 +528,9 @@ void read_with_ones(Matrix to, const double *from, int64_t count, int64_t size, 
 }
 
 // Of the inducing inputs: through their distances to the points, and through the factor of their own correlations.
-// What is added to the gradient of the logarithms of the lengthscales is subtracted from `log_lengthscale_bar`.
+// Adds to the gradients of the logarithms of the lengthscales, and of the slopes' variances.
 void inducing_gradient(const Own &own, const BackBuffers &use, int64_t outputs, double *inducing_bar,
-                       double *log_lengthscale_bar) {
+                       double *log_lengthscale_bar, double *linear_bar) {
   const int64_t size = own.size, inputs = own.inputs, rows = padded(size);
   // `lower` has A_bar A^T so far as it comes from the variances; of the means it is a product of few columns.
   add_lower(use.whitened, use.whitened_bar, outputs, use.lower, size);
@@ -504,17 +543,27 @@ void inducing_gradient(const Own &own, const BackBuffers &use, int64_t outputs, 
           [=](int64_t i, int64_t j) { return Range{j, smaller(i + ROWS, size)}; });
   product<false>(own.inverse.transposed(), use.left, use.both, 0, rows,
                  [=](int64_t i, int64_t j) { return Range{larger(i, j), size}; });
-  // Times the slope, which is symmetric; of the symmetric part this is half the sum of it and its transpose.
+  // The gradient of the correlations is minus half the sum of this and its transpose; that of the squared distances is it
+  // times the slope, which is symmetric.
+  const auto with_transpose = [&](Matrix half, Matrix out) {
+    clear(out, rows);
+    for (const View part : {half.view(), half.transposed()})
+      product(part, use.centres, out, 0, rows, [=](int64_t, int64_t) { return every(size); });
+  };
+  if (own.linear) with_transpose(use.both, use.seen_own);
   for (int64_t i = 0; i < rows * use.both.width; i += LANES) at(use.both.values + i) *= at(own.slope.values + i);
-  clear(use.own, rows);
-  for (const View half : {use.both.view(), use.both.transposed()})
-    product(half, use.centres, use.own, 0, rows, [=](int64_t, int64_t) { return every(size); });
+  with_transpose(use.both, use.own);
   for (int64_t i = 0; i < size; i++)
     for (int64_t d = 0; d < inputs; d++) {
       const double centre = own.centres[i * inputs + d];
       const double by_points = use.by_centre.row(inputs)[i] * centre - use.by_centre.row(d)[i];
       const double by_centres = use.own.row(i)[inputs] * centre - use.own.row(i)[d];
-      const double bar = 2.0 * by_points - 2.0 * by_centres;
+      double bar = 2.0 * by_points - 2.0 * by_centres;
+      if (own.linear) {
+        const double from = use.seen_from.row(d)[i], by_own = -0.5 * use.seen_own.row(i)[d];
+        bar += (from + 2.0 * by_own) * own.linear[d];
+        linear_bar[d] += centre * (from + by_own);
+      }
       log_lengthscale_bar[d] -= bar * centre;
       inducing_bar[i * inputs + d] = bar / own.lengthscale[d];
     }
@@ -529,12 +578,15 @@ void back_chain(const Layer &layer, const Points &points, int64_t chain, const B
   const Matrix all_projected = given(points.projected, num, size, chain), slope = given(points.slope, num, size, chain);
   const bool of_parameters = points.inducing_bar, further = points.points_bar || of_parameters;
   double *log_lengthscale_bar = points.log_lengthscale_bar + (of_parameters ? chain * inputs : 0);
-  if (of_parameters) for (int64_t d = 0; d < inputs; d++) log_lengthscale_bar[d] = 0.0;
+  double *linear_bar = points.log_slope_bar + (points.log_slope_bar ? chain * inputs : 0);
+  for (int64_t d = 0; of_parameters && d < inputs; d++) log_lengthscale_bar[d] = 0.0;
+  for (int64_t d = 0; points.log_slope_bar && d < inputs; d++) linear_bar[d] = 0.0;
   read_transposed(use.whitened, points.whitened + chain * size * outputs, size, outputs);
   read_with_ones(use.centres, own.centres, size, inputs, padded(size));
   clear(use.whitened_bar, padded(outputs));
   clear(use.lower, padded(size));
   clear(use.by_centre, padded(inputs + 1));
+  clear(use.seen_from, padded(inputs + 1));
   for (int64_t p = 0; p < num; p += POINTS) {
     const int64_t count = smaller(num - p, POINTS), rows = padded(count);
     const auto all_points = [=](int64_t, int64_t) { return every(rows); };
@@ -553,6 +605,12 @@ void back_chain(const Layer &layer, const Points &points, int64_t chain, const B
     product(use.mean_bar.view(), use.whitened, use.bar, 0, rows, [=](int64_t, int64_t) { return every(outputs); });
     product<false>(use.bar.view(), own.inverse, use.by_distance, 0, rows,
                    [=](int64_t, int64_t j) { return Range{j, size}; });
+    if (of_parameters || own.linear) read_with_ones(use.points, scaled + p * inputs, count, inputs, rows);
+    if (own.linear) {
+      product<false>(use.by_distance.view(), use.centres, use.along, 0, rows,
+                     [=](int64_t, int64_t) { return every(size); });
+      product(use.points.transposed(), use.by_distance, use.seen_from, 0, padded(inputs), all_points);
+    }
     for (int64_t i = 0; i < rows * slope.width; i += LANES)
       at(use.by_distance.values + i) *= at(slope.row(p) + i);
     product<false>(use.by_distance.view(), use.centres, use.moved, 0, rows,
@@ -560,23 +618,28 @@ void back_chain(const Layer &layer, const Points &points, int64_t chain, const B
     for (int64_t i = 0; i < count; i++)
       for (int64_t d = 0; d < inputs; d++) {
         const int64_t n = (p + i) * inputs + d;
-        const double bar = 2.0 * (use.moved.row(i)[inputs] * scaled[n] - use.moved.row(i)[d]);
+        double bar = 2.0 * (use.moved.row(i)[inputs] * scaled[n] - use.moved.row(i)[d]);
+        if (own.linear) {
+          const double by_own = own.variance * variance_bar[p + i];
+          bar += (use.along.row(i)[d] + 2.0 * by_own * scaled[n]) * own.linear[d];
+          if (points.log_slope_bar) linear_bar[d] += by_own * scaled[n] * scaled[n];
+        }
         if (points.points_bar) points.points_bar[chain * num * inputs + n] = bar / own.lengthscale[d];
         if (of_parameters) log_lengthscale_bar[d] -= bar * scaled[n];
       }
     if (!of_parameters) continue;
-    read_with_ones(use.points, scaled + p * inputs, count, inputs, rows);
     product(use.points.transposed(), use.by_distance, use.by_centre, 0, padded(inputs + 1), all_points);
   }
   double *whitened_bar = points.whitened_bar + chain * size * outputs;
   for (int64_t i = 0; i < size; i++)
     for (int64_t o = 0; o < outputs; o++) whitened_bar[i * outputs + o] = use.whitened_bar.row(o)[i];
   if (!of_parameters) return;
-  inducing_gradient(own, use, outputs, points.inducing_bar + chain * size * inputs, log_lengthscale_bar);
+  inducing_gradient(own, use, outputs, points.inducing_bar + chain * size * inputs, log_lengthscale_bar, linear_bar);
   double by_means = 0.0, by_variances = 0.0;
   for (int64_t i = 0; i < num * outputs; i++) by_means += mean_bar[i] * points.mean[chain * num * outputs + i];
   for (int64_t i = 0; i < num; i++) by_variances += variance_bar[i] * points.variance[chain * num + i];
   points.log_variance_bar[chain] = 0.5 * by_means + by_variances;
+  for (int64_t d = 0; points.log_slope_bar && d < inputs; d++) linear_bar[d] *= 2.0 * own.linear[d];
 }
 
 struct GramBuffers {
@@ -627,12 +690,13 @@ int64_t own_correlations(const Layer *layer, double *value, double *slope, int64
   });
 }
 
-// Upper triangular factors of correlations + jitter: [C, M', M']. Returns how many there are not.
-int64_t factorise(const Layer *layer, const double *value, double jitter, double *upper, int64_t first, int64_t last) {
-  const int64_t size = layer->num_inducing;
+// Upper triangular factors [n, M', M'] of n matrices of M rows + jitter, whose rows and matrices have these strides.
+// Returns how many do not exist.
+int64_t factorise(int64_t size, const double *matrices, int64_t stride, int64_t row, double jitter, double *upper,
+                  int64_t first, int64_t last) {
   int64_t failed = 0;
-  for (int64_t c = first; c < last; c++)
-    failed += !factorise_chain(size, given(value, size, size, c), jitter, given(upper, size, size, c));
+  for (int64_t i = first; i < last; i++)
+    failed += !factorise_one(size, matrices + i * stride, row, jitter, given(upper, size, size, i));
   return failed;
 }
 
@@ -659,13 +723,13 @@ int64_t see(const Layer *layer, int64_t num_points, const double *x, int64_t str
 }
 
 // Means [C, n, O] and variances [C, n], not below `least`, from what `see` projected. Returns as `see` does.
-int64_t moments(const Layer *layer, int64_t outputs, const double *whitened, int64_t num_points,
+int64_t moments(const Layer *layer, int64_t outputs, const double *whitened, int64_t num_points, const double *scaled,
                 const double *projected, double least, double *mean, double *variance, int64_t first, int64_t last) {
   const int64_t size = layer->num_inducing;
   return with_memory<MomentBuffers>(*layer, outputs, [&](const MomentBuffers &use) {
     for (int64_t c = first; c < last; c++)
       moments_chain(Own(*layer, c), outputs, whitened + c * size * outputs, num_points,
-                    given(projected, num_points, size, c), least, mean + c * num_points * outputs,
+                    scaled + c * num_points * layer->input_size, given(projected, num_points, size, c), least, mean + c * num_points * outputs,
                     variance + c * num_points, use);
   });
 }
