@@ -74,8 +74,8 @@ class RiskSensitiveReward(gym.Wrapper, RecordConstructorArgs):
         angle_index: which number of the observation is the angle, in rad.
         angle_step: the angle that costs one unit, in rad; 20 degrees as in the paper.
         penalise_step: return the penalised reward from `step` too.
-        wrap: count the angle from the nearest full turn. The paper does not: who has turned over once pays 18 a step for
-            ever at 20 degrees, standing upright or not.
+        wrap: count the angle from the nearest full turn. The paper does not: who has turned over once then pays 18 a
+            step for ever, at 20 degrees, standing upright or not.
 
     Raises:
         ValueError: the environment's reward is not known as a function of the actions that it is given, or an argument
