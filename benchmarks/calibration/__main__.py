@@ -9,9 +9,7 @@ each other if their tasks or models differ.
 import argparse
 import json
 import time
-from collections import defaultdict
 from pathlib import Path
-from statistics import fmean, stdev
 from typing import Any
 
 import torch
@@ -20,11 +18,9 @@ from benchmarks import RESULTS
 from benchmarks.calibration.episodes import DATA, SEEDS, TASKS
 from benchmarks.calibration.measure import TESTED_AFTER, measure
 from benchmarks.calibration.models import MODELS
-from benchmarks.report import markdown
+from benchmarks.calibration.tables import all_scores, beside_rivals
 from benchmarks.rows import command
 from gym_dgpmpc.checkpoints.files import replace_text
-
-SCORES = ("coverage_50", "coverage_90", "coverage_95", "nll", "crps", "rmse", "z2")
 
 
 def rows_file(task: str, model: str) -> str:
@@ -37,22 +33,10 @@ def every_row(results: Path) -> list[dict[str, Any]]:
     return [row for file in files if file.exists() for row in json.loads(file.read_text())["rows"]]
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Means over seeds, with the standard error of the likelihood's."""
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = defaultdict(list)
-    for row in rows:
-        groups[tuple(row[key] for key in ("task", "episodes", "test", "horizon", "model"))].append(row)
-    cells = []
-    for key, group in groups.items():
-        means = {score: fmean(row[score] for row in group) for score in SCORES}
-        shown = [f"{means[score]:.3f}" if score in ("crps", "rmse") else f"{means[score]:.2f}" for score in SCORES]
-        if len(group) > 1:
-            error = stdev([row["nll"] for row in group]) / len(group) ** 0.5
-            shown[SCORES.index("nll")] += f" ± {error:.2f}"
-        cells.append([*map(str, key), str(len(group)), *shown])
-    names = ["task", "episodes", "test", "steps", "model", "seeds", *SCORES]
+def page(rows: list[dict[str, Any]]) -> str:
+    """All tables, and what made them."""
     commands = ", ".join(f"`{each}`" for each in dict.fromkeys(row["command"] for row in rows))
-    return "\n".join([f"Made by {commands}.", "", *markdown.table(names, cells)]) + "\n"
+    return "\n".join([f"Made by {commands}.", "", *beside_rivals(rows), "", *all_scores(rows)]) + "\n"
 
 
 def main() -> None:
@@ -80,7 +64,7 @@ def main() -> None:
                 rows = [row for row in rows if row["seed"] != seed] + [{"model": name} | row | about for row in found]
                 replace_text(file, json.dumps({"rows": rows}, indent=1) + "\n")
                 print(f"{task}, seed {seed}, {name}: {time.time() - started:.0f} s", flush=True)
-    shown = table(every_row(arguments.results))
+    shown = page(every_row(arguments.results))
     replace_text(arguments.results / "calibration.md", shown)
     print(shown)
 

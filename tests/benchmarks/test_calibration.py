@@ -13,6 +13,7 @@ from benchmarks.calibration import uci
 from benchmarks.calibration.episodes import NUM_LEARNED, SMOOTH, WHITE, Recording, load, save
 from benchmarks.calibration.measure import HORIZONS, measure
 from benchmarks.calibration.scores import LEVELS, NUM_DRAWS, NUM_PARTICLES, STRIDE, forecast, scores
+from benchmarks.calibration.tables import OURS, RIVALS, SCORES, all_scores, beside_rivals
 from gym_dgpmpc.dynamics.sparse_gp.model import SparseGPDynamics
 from gym_dgpmpc.types import Transitions
 from tests.oracles.models import normal, seeded
@@ -165,3 +166,25 @@ def test_a_regression_reads_its_inputs_alone():
     data, model = uci.transitions(x, y), SparseGPDynamics(3, 0, uci.spec(2))
     inputs, targets = model._encode(data)
     assert inputs.tolist() == x.tolist() and targets.flatten().tolist() == y.tolist()
+
+
+def row(model, seed, nll, coverage=0.9, z2=1.0, horizon=1):
+    found = dict.fromkeys(SCORES, 0.25) | {"nll": nll, "coverage_90": coverage, "z2": z2}
+    return {"model": model, "seed": seed, "task": "cartpole", "episodes": 1, "test": "on", "horizon": horizon} | found
+
+
+def test_the_deep_gp_stands_beside_its_rivals_on_the_same_seeds():
+    rows = [row(OURS, 1, -1.0), row(OURS, 2, -2.0), row(OURS, 3, -9.0), row(OURS, 1, 1.0, 0.8, 2.0, horizon=10)]
+    rows += [row(RIVALS[0], 1, 1.0), row(RIVALS[0], 2, 0.5), row(RIVALS[0], 4, -99.0)]
+    rows += [row(RIVALS[1], 1, 0.0, horizon=10)]
+    summary, _, _, _, first, second = beside_rivals(rows)
+    # Means of -12 / 3 with the error 2.517; differences -2 and -2.5 have the mean -2.25 and the error 0.25.
+    assert first == "| cartpole | 1 | on | 1 | 3 | 90 | 1.00 | -4.00 ± 2.52 | **-2.25 ± 0.25** | – |"
+    assert second == "| cartpole | 1 | on | 10 | 1 | 80 | 2.00 | 1.00 | – | 1.00 |"
+    assert "of 2 points 90 % intervals hold 85 to 95 % at 1, mean z² is 0.8 to 1.3 at 1" in summary
+    assert f"of {RIVALS[0]} at 1, of {RIVALS[1]} at 0." in summary
+
+
+def test_scores_are_means_over_seeds():
+    *_, line = all_scores([row(OURS, 1, -1.0), row(OURS, 2, -2.0, coverage=0.7)])
+    assert line == f"| cartpole | 1 | on | 1 | {OURS} | 2 | 0.25 | 0.80 | 0.25 | -1.50 ± 0.50 | 0.250 | 0.250 | 1.00 |"
