@@ -56,8 +56,8 @@ def beside_rivals(rows: Iterable[Row]) -> list[str]:
     low, high = (f"{100 * bound:.0f}" for bound in GOOD_COVERAGE)
     below = ", of ".join(f"{rival} at {counts[rival]}" for rival in RIVALS)
     summary = (
-        f"{OURS}: of {counts['points']} points 90 % intervals hold {low} to {high} % at {counts['coverage']}, mean z² is "
-        f"{GOOD_Z2[0]} to {GOOD_Z2[1]} at {counts['z2']}; its mean NLL is below that of {below}."
+        f"{OURS}: of {counts['points']} points 90 % intervals hold {low} to {high} % at {counts['coverage']}, "
+        f"mean z² is {GOOD_Z2[0]} to {GOOD_Z2[1]} at {counts['z2']}; its mean NLL is below that of {below}."
     )
     return [summary, "", *markdown.table(header, cells)]
 
