@@ -28,8 +28,9 @@ def measure(
     """A row of scores for each number of episodes, test and horizon."""
     recording, spec, unit = load(task, seed, data), observation_spec(task), spread(task, data)
     sizes = recording.observation.shape[-1], recording.action.shape[-1]
-    presets = {EnsembleDynamics: NETWORKS, DeepGPDynamics: DEEP_GP}.get(getattr(make, "func", None), {})
-    settings = {**presets.get(TASKS[task], {}), **settings}
+    for of_class, presets in ((EnsembleDynamics, NETWORKS), (DeepGPDynamics, DEEP_GP)):
+        if getattr(make, "func", None) is of_class:
+            settings = {**presets.get(TASKS[task], {}), **settings}
     model, generator = make(*sizes, spec, **settings), torch.Generator().manual_seed(seed)
     predicted = model.encoder.predicted
     rows: list[dict[str, Any]] = []

@@ -29,7 +29,8 @@ def test_settings_are_found_by_id():
     assert presets.settings_for("ModCartPole-v0") == presets.PAPER["ModCartPole-v0"]
     assert presets.settings_for("Pendulum-v1") == presets.STOCK["Pendulum-v1"]
     half_cheetah = presets.settings_for("VelocityHalfCheetah-v0")
-    assert half_cheetah == {**presets.PAPER["VelocityHalfCheetah-v0"], "linear": True}
+    own = {"linear": True, "first_training_iterations": 300}
+    assert half_cheetah == {**presets.PAPER["VelocityHalfCheetah-v0"], **own}
     with_module = "gym_dgpmpc.envs.robotics:FetchReachDense-v4"
     assert presets.settings_for(with_module) == presets.STOCK["FetchReachDense-v4"]
     assert presets.settings_for("ToyPush-v0") == {}
