@@ -81,16 +81,17 @@ def training(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
     standardised = Data(Normaliser.fit(x)(x), Normaliser.fit(y)(y))
     start = initial_model(model.kernel, standardised, num_layers, model.num_inducing, model.num_chains, generator)
     whitened = sghmc.init(x.new_zeros(model.num_chains, start.num_whitened()))
-    state = initial_state(start, whitened, standardised.num_rows, generator)
-    together = 20
-    run = Chains(start, state, standardised, model.inference, round(BURN_IN * together * (repeats + 2)))
+    together, row = 20, {"what": "training iteration"}
 
-    def iterate() -> None:
+    def iterate(run: Chains) -> None:
         for _ in range(together):
             run.step(generator)
 
-    row, ours = {"what": "training iteration"}, {"how": "this package", "chains": model.num_chains}
-    yield row | ours | timed(iterate, repeats, 1 / together)
+    for how, compile in (("this package, PyTorch", False), ("this package", True)):
+        state = initial_state(start, whitened, standardised.num_rows, generator)
+        burn_in, ours = round(BURN_IN * together * (repeats + 2)), {"how": how, "chains": model.num_chains}
+        run = Chains(start, state, standardised, model.inference, burn_in, compile=compile)
+        yield row | ours | timed(partial(iterate, run), repeats, 1 / together)
     bare = floor.bare_training(num_layers, BATCH_SIZE, model.num_chains, model.inference.hyperparameters_every)
     yield (
         row

@@ -2,7 +2,8 @@
 
 The lowest room of the Gaussian-process code: `layer.py` builds covariances from them, `features.py` their spectral
 counterpart. A kernel is one object of the class `Kernel`, and `KERNELS` holds all there are: a new one is a class here
-and an entry there. Rollouts are several times faster if `dynamics/deep_gp/native/rollout.cpp` knows its name too.
+and an entry there. Rollouts and training are several times faster if `dynamics/deep_gp/native/rollout.cpp` and
+`inference/native/layers.cpp` know its name too.
 """
 
 from abc import ABC, abstractmethod

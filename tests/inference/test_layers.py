@@ -82,6 +82,26 @@ def test_compiled_layers_are_pytorchs(kernel, linear, sizes):
 
 
 @needs_compiler
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_compiled_kernels_are_exact_at_every_distance(kernel):
+    """One centre, at zero, from which distances have no rounding; k of it is the projected point up to the jitter.
+
+    exp(-s) is as wrong as the rounding of s, relative to it; what is beyond s = 300 is as at 300.
+    """
+    points = torch.cat([torch.zeros(1), torch.logspace(-8, 3.0, 200)]).double()
+    layer = Layer(KERNELS[kernel], *(torch.zeros(1, *shape).double() for shape in ((1, 1), (1,), ())))
+    terms = layer_terms(layer)
+    assert terms.compiled is not None
+    seen = see(terms, points.view(1, -1, 1))
+    expected = KERNELS[kernel].correlation_and_slope(points.square())
+    rounding = 8 * 2**-53 * (1.0 + math.sqrt(7.0) * points + 0.5 * points.square())
+    for found, exact in zip(
+        (seen.projected[0, 0] / terms.inverse[0, 0, 0], seen.slope[0, :, 0]), expected, strict=True
+    ):
+        assert ((found - exact).abs() <= rounding * exact.abs() + 1e-120).all()
+
+
+@needs_compiler
 @pytest.mark.parametrize("size", [1, 7, 8, 33, 104])
 def test_compiled_factors_are_lapacks(size):
     """Of matrices in any memory; to the rounding of a Cholesky factorisation, M eps times the matrix (Higham 2002)."""

@@ -100,14 +100,15 @@ struct Pair {
 struct RBF {
   static constexpr const char *name = "rbf";
   static inline Pair of(vec sqdist) {
-    const vec half = 0.5 * sqdist, value = decay_of(half > FARTHEST ? all(FARTHEST) : half);
+    const vec half = sqdist < 0.0 ? vec{} : 0.5 * sqdist;
+    const vec value = decay_of(half > FARTHEST ? all(FARTHEST) : half);
     return {value, -0.5 * value};
   }
 };
 
-// s = sqrt(2 nu) r of a Matern kernel.
+// s = sqrt(2 nu) r of a Matern kernel; two points that are so near are one.
 inline vec distance(vec sqdist, double degrees) {
-  const vec s = square_root(degrees * sqdist);
+  const vec s = square_root(sqdist <= 1e-12 ? vec{} : degrees * sqdist);
   return s > FARTHEST ? all(FARTHEST) : s;
 }
 
@@ -149,9 +150,7 @@ struct Matern72 {
 template <class Kernel>
 void evaluate(double *values, double *slopes, int64_t count) {
   for (int64_t i = 0; i < count; i += LANES) {
-    const vec sqdist = at(values + i);
-    // Below this two points are one; NaN stays.
-    const Pair found = Kernel::of(sqdist <= 1e-12 ? vec{} : sqdist);
+    const Pair found = Kernel::of(at(values + i));
     at(values + i) = found.value;
     at(slopes + i) = found.slope;
   }
