@@ -28,7 +28,8 @@ def cholesky(
     """
     eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
     for rung in _LADDER:
-        factor, info = torch.linalg.cholesky_ex(covariance + (rung * jitter * scale) * eye)
+        jittered = covariance + (rung * jitter * scale) * eye if jitter else covariance
+        factor, info = torch.linalg.cholesky_ex(jittered)
         # LAPACK lets an infinite diagonal pass; some builds of it a NaN too. Either shows in the factor's diagonal.
         if not bool(info.any()) and bool(factor.diagonal(dim1=-2, dim2=-1).isfinite().all()):
             return factor

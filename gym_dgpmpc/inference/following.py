@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gym_dgpmpc.data.standardised import Data, DataSource
 from gym_dgpmpc.gp.deep_gp import Factorised
-from gym_dgpmpc.inference.gradients import forward, layer_terms
+from gym_dgpmpc.inference.gradients import Passed, forward, layer_terms
 from gym_dgpmpc.inference.last_layer import LastLayerEvidence, last_layer_evidence
 from gym_dgpmpc.inference.latents import move_latents, with_latents
 
@@ -80,14 +80,16 @@ class Follower:
         rows = data.rows(torch.arange(begin, data.num_rows, dtype=torch.int64, device=position.device))
         # Of what the sum does not hold yet.
         recent = [latent[:, begin:] for latent in grown]
+        passed = None
         if unsettled < data.num_rows:
-            self._move(position, _part(rows, unsettled - begin), [e[:, unsettled - begin :] for e in recent], generator)
+            moving = [latent[:, unsettled - begin :] for latent in recent]
+            passed = self._move(position, _part(rows, unsettled - begin), moving, generator).since(whole - unsettled)
         total = self._sum
         for first in range(0, whole - begin, BLOCK):
-            total = total.plus(self._evidence(rows, recent, first, first + BLOCK))
+            total = self._evidence(_part(rows, first, first + BLOCK), recent, first, total)
         evidence = total
         if whole < data.num_rows:
-            evidence = total.plus(self._evidence(rows, recent, whole - begin, data.num_rows - begin))
+            evidence = self._evidence(_part(rows, whole - begin), recent, whole - begin, total, passed)
         positions = evidence.posterior().positions(self._inner, num_samples, generator)
         self._sum, self._num_summed = total, whole
         return Followed(positions, grown, rows.y)
@@ -98,21 +100,28 @@ class Follower:
         batch: Data,
         latents: Sequence[Float[Tensor, "C n D"]],
         generator: torch.Generator,
-    ) -> None:
-        """One Metropolis step of the latents of these rows, in place."""
-        whitened, present = self._factorised.model.split(position), [latent.to(position) for latent in latents]
-        _, moved = move_latents(self._factorised, self._terms, whitened, batch, present, generator)
+    ) -> Passed:
+        """One Metropolis step of the latents of these rows, in place; the rows as they then pass the last layer."""
+        whitened = self._factorised.model.split(position)
+        passed, moved = move_latents(self._factorised, self._terms, whitened, batch, latents, generator)
         for latent, new in zip(latents, moved, strict=True):
             latent.copy_(new)
+        return passed[-1]
 
     def _evidence(
-        self, rows: Data, latents: Sequence[Float[Tensor, "C n D"]], first: int, end: int
+        self,
+        batch: Data,
+        latents: Sequence[Float[Tensor, "C n D"]],
+        first: int,
+        others: LastLayerEvidence,
+        passed: Passed | None = None,
     ) -> LastLayerEvidence:
-        """Of the rows from ``first`` to ``end``."""
-        batch = _part(rows, first, end)
-        x = batch.x.expand(len(self._inner), -1, -1)
-        passed = forward(self._terms, self._whitened, x, [latent[:, first:end].to(x) for latent in latents])
-        return last_layer_evidence(self._factorised, self._terms[-1], passed[-1], batch.y)
+        """Of the others and these rows, whose latents begin at ``first``; how they pass may be known already."""
+        if passed is None:
+            x = batch.x.expand(len(self._inner), -1, -1)
+            own = [latent[:, first : first + batch.num_rows].to(x) for latent in latents]
+            passed = forward(self._terms, self._whitened, x, own)[-1]
+        return last_layer_evidence(self._factorised, self._terms[-1], passed, batch.y, others=others)
 
 
 def _whole(num_rows: int) -> int:

@@ -55,6 +55,12 @@ class Passed(NamedTuple):
     mean: Float[Tensor, "C n O"]
     variance: Float[Tensor, "C n"]
 
+    def since(self, first: int) -> "Passed":
+        """The points from ``first`` on."""
+        scaled, projected, slope = self.seen
+        seen = Seen(scaled[:, first:], projected[..., first:], slope[:, first:])
+        return Passed(seen, self.mean[:, first:], self.variance[:, first:])
+
 
 class Gradients(NamedTuple):
     """Of the mean log likelihood of a batch."""

@@ -46,10 +46,6 @@ class LastLayerEvidence(NamedTuple):
     precision: Float[Tensor, "C T M M"]
     moment: Float[Tensor, "C T M"]
 
-    def plus(self, other: "LastLayerEvidence") -> "LastLayerEvidence":
-        """Of both data."""
-        return LastLayerEvidence(self.precision + other.precision, self.moment + other.moment)
-
     def posterior(self) -> LastLayerPosterior:
         """With the standard normal prior.
 
@@ -69,7 +65,12 @@ class LastLayerEvidence(NamedTuple):
 
 
 def last_layer_evidence(
-    factorised: Factorised, terms: LayerTerms, passed: Passed, y: Float[Tensor, "n T"], weight: float = 1.0
+    factorised: Factorised,
+    terms: LayerTerms,
+    passed: Passed,
+    y: Float[Tensor, "n T"],
+    weight: float = 1.0,
+    others: LastLayerEvidence | None = None,
 ) -> LastLayerEvidence:
     """Bayesian linear regression on a_n = L_z^-1 k_zn whose datum n has the noise s_n = k_nn - |a_n|^2 + noise.
 
@@ -78,9 +79,15 @@ def last_layer_evidence(
     Args:
         terms, passed: of the last layer.
         weight: how often each datum counts: N / n where the rows are a subset of the data.
+        others: what other data say, which is added.
     """
     a = terms.variance.sqrt() * passed.seen.projected
     noise = factorised.model.noise_variance
     weights = weight / (passed.variance.unsqueeze(1) + noise.unsqueeze(-1))  # "C T n"
     weighted = a.unsqueeze(1) * weights.unsqueeze(2)
-    return LastLayerEvidence(weighted @ a.mT.unsqueeze(1), (weighted @ y.mT.unsqueeze(-1)).squeeze(-1))
+    moment = (weighted @ y.mT.unsqueeze(-1)).squeeze(-1)
+    if others is None:
+        return LastLayerEvidence(weighted @ a.mT.unsqueeze(1), moment)
+    # In one product for all targets of a chain, and no more passes over the large matrices.
+    precision = torch.baddbmm(others.precision.flatten(1, 2), weighted.flatten(1, 2), a.mT)
+    return LastLayerEvidence(precision.view_as(others.precision), others.moment + moment)

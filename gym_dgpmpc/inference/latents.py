@@ -45,6 +45,7 @@ def move_latents(
     (preconditioned Crank-Nicolson; Cotter et al. 2013). r is one of `PROPOSALS`.
 
     Args:
+        latents: as they are kept; what is proposed is rounded to their precision.
         first: the points as they pass the first layer, which no latent comes before, if that is known already.
     """
     x = batch.x.expand(len(whitened[0]), -1, -1)
@@ -54,9 +55,9 @@ def move_latents(
     correlation = PROPOSALS[int(torch.randint(len(PROPOSALS), (1,), generator=generator, device=generator.device))]
     proposed = []
     for latent in latents:
-        fresh = torch.randn(latent.shape, generator=generator, dtype=latent.dtype, device=latent.device)
-        proposed.append(correlation * latent + math.sqrt(1.0 - correlation**2) * fresh)
-    ways = [forward(terms, whitened, x, each, first) for each in (latents, proposed)]
+        fresh = torch.randn(latent.shape, generator=generator, dtype=x.dtype, device=latent.device)
+        proposed.append((correlation * latent + math.sqrt(1.0 - correlation**2) * fresh).to(latent.dtype))
+    ways = [forward(terms, whitened, x, [e.to(x.dtype) for e in each], first) for each in (latents, proposed)]
     present, other = (likelihood(factorised, way, batch.y) for way in ways)
     uniform = torch.rand(present.shape, generator=generator, dtype=present.dtype, device=present.device)
     accepted = uniform.log() < other - present

@@ -29,8 +29,9 @@ def truncated_normal(
     With U uniform on [-1, 1), z = sqrt(2) erfinv(U erf(2 / sqrt 2)). The argument of erfinv stays within +-0.9545, so
     no draw is infinite in any precision.
     """
-    uniform = torch.rand(shape, generator=generator, device=device, dtype=dtype).mul_(2.0).sub_(1.0)
-    noise = uniform.mul_(math.erf(TRUNCATION / math.sqrt(2.0))).erfinv_().mul_(math.sqrt(2.0))
+    within = math.erf(TRUNCATION / math.sqrt(2.0))
+    uniform = torch.rand(shape, generator=generator, device=device, dtype=dtype)
+    noise = uniform.mul_(2.0 * within).sub_(within).erfinv_().mul_(math.sqrt(2.0))
     return noise.clamp_(-TRUNCATION, TRUNCATION)
 
 
@@ -42,14 +43,14 @@ def elite_shares(scores: Float[Tensor, " K"], num_elites: int) -> Float[Tensor, 
     the objective says nothing. A score that is not finite has no share.
     """
     # topk ranks NaN highest, hence the replacement before it.
-    ranked = scores.masked_fill(~scores.isfinite(), -math.inf)
+    ranked = scores.where(scores.isfinite(), -math.inf)
     best = ranked.topk(num_elites).values
-    valid = best.isfinite()
-    last = best.masked_fill(~valid, math.inf).min()
+    valid = best > -math.inf
+    last = best.where(valid, math.inf).min()
     above, tied = ranked > last, ranked == last
-    places = valid.sum() - above.sum()
-    share = above.to(scores.dtype) + tied.to(scores.dtype) * (places / tied.sum().clamp(min=1))
-    return share / valid.sum().clamp(min=1)
+    num_valid, num_above, num_tied = valid.sum(), above.sum(), tied.sum()
+    share = above + tied * ((num_valid - num_above) / num_tied.clamp(min=1)).to(scores.dtype)
+    return share / num_valid.clamp(min=1)
 
 
 class GaussianPlan(NamedTuple):
@@ -159,6 +160,7 @@ class CEM:
         low, high = self.action_low, self.action_high
         mean, variance = plan.mean.clamp(low, high), plan.std.square()
         shape = (self.num_candidates, self.horizon, low.shape[0])
+        narrowest = torch.where(low == high, math.inf, self.min_std * (high - low))
         num_nonfinite, iterations_done, expected_return = 0, 0, math.nan
         now, slowest = time.perf_counter(), 0.0
         for iteration in range(1, self.num_iterations + 1):
@@ -169,7 +171,7 @@ class CEM:
             room = torch.minimum(mean - low, high - mean)
             std = torch.minimum(variance.sqrt(), room / TRUNCATION)
             noise = truncated_normal(shape, generator, device=low.device, dtype=low.dtype)
-            candidates = (mean + std * noise).clamp(low, high)
+            candidates = torch.addcmul(mean, std, noise).clamp_(low, high)
 
             # Score them and select the elites.
             scores = objective(candidates)
@@ -180,14 +182,14 @@ class CEM:
             weight = share.to(low.dtype)
 
             # Refit: m <- a m + (1 - a) mean(elites), v <- a v + (1 - a) var(elites), population variance.
-            elite_mean = torch.einsum("k,kha->ha", weight, candidates)
-            elite_variance = torch.einsum("k,kha->ha", weight, (candidates - elite_mean).square())
-            mean = self.smoothing * mean + (1.0 - self.smoothing) * elite_mean
-            variance = self.smoothing * variance + (1.0 - self.smoothing) * elite_variance
+            elite_mean = torch.tensordot(weight, candidates, 1)
+            elite_variance = torch.tensordot(weight, (candidates - elite_mean).square_(), 1)
+            mean = elite_mean.lerp(mean, self.smoothing)
+            variance = elite_variance.lerp(variance, self.smoothing)
 
             # All that the host must know, in its one synchronisation of the iteration.
-            narrow = ((variance.sqrt() < self.min_std * (high - low)) | (low == high)).all()
-            value = (share * scores.masked_fill(~finite, 0.0)).sum()
+            narrow = (variance.sqrt() < narrowest).all()
+            value = share @ scores.where(finite, 0.0)
             num_finite, is_narrow, expected_return = torch.stack([finite.sum(), narrow, value]).tolist()
             num_nonfinite += self.num_candidates - int(num_finite)
             if num_finite == 0:

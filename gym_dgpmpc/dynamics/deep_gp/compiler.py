@@ -20,7 +20,10 @@ from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 
-FLAGS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
+FLAGS = (
+    "-std=c++17", "-O3", "-march=native", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-shared",
+    "-fPIC",
+)  # fmt: skip
 COMPILERS = ("c++", "g++", "clang++")
 BUILD_TIMEOUT = 120.0
 """Seconds after which a compiler is taken to hang."""

@@ -145,7 +145,7 @@ def test_a_cache_that_cannot_be_used_is_done_without(failing, tmp_path, monkeypa
         monkeypatch.setattr(compiler.ctypes, "CDLL", refuse_the_cache)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert compiler.load("rollout").units() > 0
+        assert compiler.load("rollout").points() > 0
 
 
 def test_without_any_folder_there_is_the_warning(monkeypatch):
