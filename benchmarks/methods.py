@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
@@ -31,12 +32,16 @@ NO_SETTINGS = {
     "tensorboard_log",
     "stats_window_size",
     "device",
+    "first_controller",
     "_init_setup_model",
 }
 """Arguments that do not influence what is learned, or that the runner sets itself."""
 MAX_LAYERS = 5
 TD3_NOISE = 0.1
 """Standard deviation of the exploration of Fujimoto et al. (2018), in half the width of the action range."""
+
+OPTIMUM: Mapping[str, Any] = {"num_epochs": 300, "patience": 15}
+"""An ensemble's training to its held-out optimum: until 15 epochs in a row bring nothing, 300 at most."""
 
 _FASTER: Mapping[str, Any] = {"half_precision": True}
 """A third of the time where the processor has instructions for it; what it does to predictions: docs/deviations.md."""
@@ -223,10 +228,22 @@ ALL_METHODS: tuple[Method, ...] = (
         for draw in ("TS1", "TSinf")
     ),
     PlanningMethod("PETS as published", PETSAgent, _of(presets.PETS), {"draw": "TSinf", **_FASTER}),
-    *(PlanningMethod(f"GP-{draw}", GPMPCAgent, _of(presets.COMPARISON_GP), {"draw": draw}) for draw in ("MM", "DS")),
+    PlanningMethod(
+        "PETS TSinf to its optimum",
+        PETSAgent,
+        _of(presets.COMPARISON_PETS),
+        {"draw": "TSinf", **OPTIMUM, **_FASTER},
+    ),
+    *(
+        PlanningMethod(f"GP-{draw}{name}", GPMPCAgent, _of(presets.COMPARISON_GP), {"draw": draw, "add_noise": noise})
+        for draw in ("MM", "DS")
+        for name, noise in (("", False), (" with noise", True))
+    ),
     PlanningMethod("true dynamics", true_dynamics_agent, _planning_alone),
     ModelFreeMethod("SAC", SAC, _off_policy),
     ModelFreeMethod("TD3", TD3, lambda task: {**_off_policy(task), "exploration_noise": TD3_NOISE}),
+    ModelFreeMethod("CrossQ", CrossQ, _off_policy),
+    ModelFreeMethod("TQC", TQC, _off_policy),
     ModelFreeMethod("PPO", PPO, _on_policy, acts_by="forward"),
 )
 

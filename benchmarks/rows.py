@@ -35,6 +35,7 @@ def measure_missing(
     wanted: Sequence[Row],
     measure: Callable[[Row], Row],
     settings: argparse.ArgumentParser,
+    page: Callable[[Sequence[Row]], str] | None = None,
 ) -> str:
     """Measure what the benchmark's files do not have, and write them again after each measurement.
 
@@ -44,18 +45,20 @@ def measure_missing(
         wanted: for each measurement everything that makes it another one.
         measure: gives the results of one.
         settings: has the options that are part of each of ``wanted``; for files whose rows do not name them.
+        page: what ``name.md`` says of the rows; default: `document`.
 
     Returns:
-        The table of all rows, those of other settings included.
+        The page of all rows, those of other settings included.
     """
+    page = document if page is None else page
     file = results / f"{name}.json"
     rows = read_rows(file, settings)
     for row in wanted:
         if find(rows, **row) is None:
             rows.append(row | measure(row) | {"command": command(name), "torch": torch.__version__})
             replace_text(file, json.dumps({"rows": rows}, indent=2) + "\n")
-            replace_text(results / f"{name}.md", document(rows))
-    return document(rows)
+            replace_text(results / f"{name}.md", page(rows))
+    return page(rows)
 
 
 def read_rows(file: Path, settings: argparse.ArgumentParser) -> list[Row]:
@@ -74,10 +77,15 @@ def read_rows(file: Path, settings: argparse.ArgumentParser) -> list[Row]:
 
 def document(rows: Sequence[Row]) -> str:
     """All rows as a table, with the commands that made them."""
-    commands = dict.fromkeys(f"`{row['command']}`" for row in rows)
     names = [name for name in dict.fromkeys(name for row in rows for name in row) if name not in ABOUT]
     cells = [[_cell(row.get(name, markdown.NOTHING)) for name in names] for row in rows]
-    return "\n".join([f"Made by {', '.join(commands)}.", "", *markdown.table(names, cells)]) + "\n"
+    return "\n".join([made_by(rows), "", *markdown.table(names, cells)]) + "\n"
+
+
+def made_by(rows: Sequence[Row]) -> str:
+    """The commands that made the rows."""
+    commands = dict.fromkeys(f"`{row['command']}`" for row in rows)
+    return f"Made by {', '.join(commands)}."
 
 
 def _cell(value: Any) -> str:

@@ -177,7 +177,8 @@ class Run:
         settings = self.settings
         identity = {"environment": self.task.name, "method": self.method, **settings, "seed": self.seed}
         advice = f"choose another folder for unfinished runs, or delete {self._folder(folders.work)}"
-        open_folder = partial(RunFolder, self._folder(folders.work), identity, otherwise=advice)
+        before = method.settings(self.task)  # what a run counts as that is older than a setting
+        open_folder = partial(RunFolder, self._folder(folders.work), identity, defaults=before, otherwise=advice)
         with closing(self.task.make()) as env, closing(_patiently(open_folder)) as folder:
             run = TrainingRun(
                 folder,

@@ -21,6 +21,26 @@ def check_counts(**counts: object) -> None:
             raise ValueError(f"{name} must be at least 1, got {value}")
 
 
+def check_reals(interval: str, **values: object) -> None:
+    """Refuse settings that are no real number, or not one of an interval.
+
+    Args:
+        interval: such as "[0, 1)"; a bracket includes its end, a parenthesis does not. NaN is in none.
+
+    Raises:
+        TypeError, ValueError: naming the setting, the interval and the value.
+    """
+    low, high = map(float, interval[1:-1].split(","))
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, numbers.Real):
+            raise TypeError(f"{name} must be a number, got {value!r}")
+        number = float(value)
+        above = low <= number if interval[0] == "[" else low < number
+        below = number <= high if interval[-1] == "]" else number < high
+        if not (above and below):
+            raise ValueError(f"{name} must lie in {interval}, got {value}")
+
+
 def saved_count(name: str, value: object, lowest: int = 0) -> int:
     """A whole number of a file, if it is one.
 

@@ -7,17 +7,19 @@ old seeds keep their meaning.
 """
 
 import hashlib
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 
 class Generators(NamedTuple):
     """An agent's generators, one per use."""
 
     exploration: torch.Generator
-    """The uniform actions before there is a model."""
+    """The uniform actions before there is a model; other random ones have an `episode_generator`."""
     fit: torch.Generator
     """Training and re-sampling of the dynamics model."""
     planning: torch.Generator
@@ -62,6 +64,20 @@ def observation_generator(seed: int, observation: np.ndarray, device: torch.devi
     digest = hashlib.blake2b(np.ascontiguousarray(observation).tobytes(), digest_size=4).digest()
     key = int.from_bytes(digest, "little")
     return torch.Generator(device).manual_seed(derive_seed(seed, "deterministic_prediction", key))
+
+
+def quick_normals(shape: Sequence[int], like: Tensor, generator: torch.Generator) -> Tensor:
+    """Standard normals of the dtype and device of ``like``, drawn in float32.
+
+    On a CPU that is several times faster than float64. They are rounded to 24 bits, and none is beyond 5.8, where one
+    of 150 million would be: for noise, whose size nobody knows to seven digits.
+    """
+    return torch.randn(shape, generator=generator, dtype=torch.float32, device=like.device).to(like.dtype)
+
+
+def episode_generator(seed: int, episode: int, part: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """A generator for the actions of a part of a random episode, by the numbers of episode and part alone."""
+    return torch.Generator(device).manual_seed(derive_seed(seed, "exploration", episode, part))
 
 
 def fresh_seed() -> int:

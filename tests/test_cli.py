@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import gymnasium
 import pytest
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 
 from gym_dgpmpc import cli
 from gym_dgpmpc.agents import DGPMPCAgent
+from gym_dgpmpc.agents.exploration import ExplorationName
 from gym_dgpmpc.agents.presets import PAPER, STOCK
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.checkpoints.format import read_checkpoint
@@ -23,6 +25,8 @@ from gym_dgpmpc.cli import options
 from gym_dgpmpc.dynamics.deep_gp.draws import DRAWS, REFRESHES
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.planning import PLANNERS, register_planner
+from gym_dgpmpc.planning.registry import PlannerName
+from gym_dgpmpc.planning.risk import RiskName
 from gym_dgpmpc.runs import rendering
 from tests.agents.point_mass import LENGTH
 from tests.command_line import SMALLEST, dgpmpc, is_one_line_error
@@ -365,11 +369,28 @@ def test_any_registered_planner(run):
         del PLANNERS["shooting"]
 
 
+def test_planner_risk_and_exploration_are_options(run):
+    options = ["--planner=icem", "--noise-beta=2", "--risk=cvar", "--cvar-share=0.5", "--exploration=coloured"]
+    command = ("train", ENV_ID, *SMALLEST, "--episodes", 1, "--no-video", "--out", "a")
+    result = run(*command, *options, "--exploration-beta=0.5")
+    assert result.exit_code == 0, result.output
+    arguments = read_checkpoint("a/agent.zip").config["arguments"]
+    expected = {"planner": "icem", "noise_beta": 2.0, "risk": "cvar", "cvar_share": 0.5, "exploration": "coloured"}
+    assert {**arguments, **expected, "exploration_beta": 0.5} == arguments
+    assert run("evaluate", "a", "--episodes", 1).exit_code == 0
+    assert is_one_line_error(run(*command, *options), "exploration_beta was 0.5, now 1.0")
+    assert is_one_line_error(run(*command, "--noise-beta=2"), "plans by cem", "noise_beta")
+    shown = re.sub(r"[\s│]+", " ", run_wide("train", "--help"))
+    for choices in (PlannerName, RiskName, ExplorationName):
+        assert "|".join(get_args(choices)) in shown
+
+
 def test_a_run_from_before_a_setting_existed_goes_on(run):
     command = ("train", ENV_ID, *SMALLEST, "--no-video", "--out", "a")
     assert run(*command, "--episodes", 1).exit_code == 0
     content = json.loads(Path("a/settings.json").read_text())
-    del content["settings"]["planner"], content["settings"]["smoothing"]
+    for name in ("planner", "smoothing", "risk", "exploration_hold"):
+        del content["settings"][name]
     Path("a/settings.json").write_text(json.dumps(content))
     result = run(*command, "--episodes", 2)
     assert result.exit_code == 0, result.output

@@ -1,9 +1,10 @@
 """The split of the seed: fixed for ever, different for every use."""
 
 import numpy as np
+import scipy.stats
 import torch
 
-from gym_dgpmpc.randomness import STREAMS, derive_seed, fresh_seed, observation_generator, split_seed
+from gym_dgpmpc.randomness import STREAMS, derive_seed, fresh_seed, observation_generator, quick_normals, split_seed
 
 
 def test_the_split_is_the_documented_one():
@@ -41,3 +42,16 @@ def test_fresh_seeds_are_fresh_and_fit_an_environment():
     seeds = [fresh_seed() for _ in range(5)]
     assert len(set(seeds)) == 5
     assert all(0 <= seed < 2**32 for seed in seeds)
+
+
+def test_quick_normals_are_normal_and_fine_grained():
+    """Against the normal law in its middle and its tails, and the generator decides everything."""
+    like, generator = torch.zeros(1, dtype=torch.float64), split_seed(0).fit
+    drawn = quick_normals((4, 100_000), like, generator)
+    assert drawn.dtype == torch.float64 and drawn.shape == (4, 100_000)
+    assert scipy.stats.kstest(drawn.flatten().numpy(), "norm").pvalue > 1e-3
+    beyond = int((drawn.abs() > 4.0).sum())  # binomial with a mean of 25
+    assert abs(beyond - 25.3) < 5 * 25.3**0.5
+    assert len(drawn.unique()) > 0.95 * drawn.numel()
+    again = quick_normals((4, 100_000), like, split_seed(0).fit)
+    assert torch.equal(again, drawn)

@@ -13,7 +13,8 @@ import torch
 from benchmarks.calibration.episodes import DATA, SMOOTH, TASKS, WHITE, load, observation_spec, spread
 from benchmarks.calibration.models import Make
 from benchmarks.calibration.scores import forecast, scores
-from gym_dgpmpc.agents.presets import NETWORKS
+from gym_dgpmpc.agents.presets import DEEP_GP, NETWORKS
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
 
 HORIZONS = {"cartpole": (1, 10, 20), "pendulum": (1, 10, 20), "reacher": (1, 10, 20), "cheetah": (1, 10, 20, 40)}
@@ -27,8 +28,9 @@ def measure(
     """A row of scores for each number of episodes, test and horizon."""
     recording, spec, unit = load(task, seed, data), observation_spec(task), spread(task, data)
     sizes = recording.observation.shape[-1], recording.action.shape[-1]
-    if getattr(make, "func", None) is EnsembleDynamics:
-        settings = {**NETWORKS.get(TASKS[task], {}), **settings}
+    for of_class, presets in ((EnsembleDynamics, NETWORKS), (DeepGPDynamics, DEEP_GP)):
+        if getattr(make, "func", None) is of_class:
+            settings = {**presets.get(TASKS[task], {}), **settings}
     model, generator = make(*sizes, spec, **settings), torch.Generator().manual_seed(seed)
     predicted = model.encoder.predicted
     rows: list[dict[str, Any]] = []

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 
+from benchmarks.methods import OPTIMUM
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
 from gym_dgpmpc.dynamics.sparse_gp.model import SparseGPDynamics
@@ -14,7 +15,7 @@ MODELS: dict[str, Make] = {
     "DGP L=2": partial(DeepGPDynamics, num_layers=2),
     "DGP L=3": partial(DeepGPDynamics, num_layers=3),
     "PETS, 5 epochs": partial(EnsembleDynamics),
-    "PETS, held-out optimum": partial(EnsembleDynamics, num_epochs=300, patience=15),
+    "PETS, held-out optimum": partial(EnsembleDynamics, **OPTIMUM),
     "sparse GP": partial(SparseGPDynamics),
     "sparse GP with noise": partial(SparseGPDynamics, add_noise=True),
     "exact GP": partial(SparseGPDynamics, exact=True),

@@ -20,7 +20,20 @@ OURS = "DGP-MPC"
 CEILING = "true dynamics"
 """The method that every other is measured against: the same planner with the simulator as its model."""
 
-PEERS = ("PETS TSinf", "PETS TS1", "GP-MM", "GP-DS", "SAC", "TD3", "PPO")
+PEERS = (
+    "PETS TSinf",
+    "PETS TSinf to its optimum",
+    "PETS TS1",
+    "GP-MM",
+    "GP-MM with noise",
+    "GP-DS",
+    "GP-DS with noise",
+    "SAC",
+    "TD3",
+    "CrossQ",
+    "TQC",
+    "PPO",
+)
 """The methods of the comparison in the order of legends; others come after them."""
 
 NEAR = 0.9

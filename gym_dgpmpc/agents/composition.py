@@ -7,17 +7,18 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import torch
 from gymnasium import spaces
 
 from gym_dgpmpc.agents.signature import PLAIN
-from gym_dgpmpc.planning.registry import is_ready_made, make_planner, planner_factory
+from gym_dgpmpc.planning.registry import PlannerName, is_ready_made, make_planner, planner_factory
+from gym_dgpmpc.planning.risk import RiskMeasure
 from gym_dgpmpc.settings import Setting, joined, refuse_unknown, settings_of
 from gym_dgpmpc.types import DynamicsFactory, DynamicsModel, ObservationSpec, Planner, PlannerFactory
 
-AnyPlanner = str | PlannerFactory | Planner
+AnyPlanner = PlannerName | str | PlannerFactory | Planner
 """A planner by name, by what makes it, or ready-made."""
 
 
@@ -27,6 +28,7 @@ class PlanningArguments(NamedTuple):
     num_particles: int
     actions_per_plan: int
     time_budget: float | None
+    measure: RiskMeasure
 
 
 class MadeOf(NamedTuple):
@@ -72,6 +74,26 @@ def model_settings(agent: MadeOf) -> dict[str, Setting]:
 def setting_property(name: str) -> property:
     """A setting as an attribute of the agent; it is decided when the agent is made, so it cannot be set."""
     return property(lambda agent: agent.composition.setting(name))
+
+
+Value = TypeVar("Value")
+
+
+class OfController(Generic[Value]):
+    """An attribute of the agent's controller as one of the agent, to be read and set; the controller checks it."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, agent: None, owner: type) -> "OfController[Value]": ...
+    @overload
+    def __get__(self, agent: Any, owner: type) -> Value: ...
+    def __get__(self, agent: Any, owner: type) -> Any:
+        return self if agent is None else getattr(agent.controller, self._name)
+
+    def __set__(self, agent: Any, value: Value) -> None:
+        setattr(agent.controller, self._name, value)
 
 
 class Composition:

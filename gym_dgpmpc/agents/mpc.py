@@ -31,12 +31,14 @@ from gym_dgpmpc.agents.composition import (
     AnyPlanner,
     Composition,
     MadeOf,
+    OfController,
     PlanningArguments,
     own_settings,
     part_settings,
     setting_property,
 )
 from gym_dgpmpc.agents.episode import EpisodeRecord
+from gym_dgpmpc.agents.exploration import ExplorationName, Explorer, FirstController
 from gym_dgpmpc.agents.logs import Logs
 from gym_dgpmpc.agents.policy import MPCPolicy
 from gym_dgpmpc.agents.progress import Progress, RandomStreams
@@ -53,6 +55,7 @@ from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.plan_state import PackedPlans
 from gym_dgpmpc.planning.registry import planner_factory
+from gym_dgpmpc.planning.risk import RiskMeasure, RiskName
 from gym_dgpmpc.randomness import Generators, fresh_seed, split_seed
 from gym_dgpmpc.settings import Setting, joined, settings_of
 from gym_dgpmpc.tasks.borders import received_batch
@@ -68,7 +71,6 @@ from gym_dgpmpc.types import (
     DynamicsModel,
     ObservationSpec,
     Planner,
-    PlannerFactory,
     RewardFn,
     StateDict,
     Stateful,
@@ -87,9 +89,9 @@ MANY_GIVEN_UP = 10
 class MPCAgent(BaseAlgorithm):
     """Learns a dynamics model from its own experience and acts by planning through it.
 
-    The first steps are uniformly random. From then on the model is trained at each episode's start, and every action
-    comes from a plan: P worlds are drawn from the model, and the planner searches the H actions with the highest
-    return, averaged over the worlds.
+    The first steps are random, or another controller's. From then on the model is trained at each episode's start, and
+    every action comes from a plan: P worlds are drawn from the model, and the planner searches the H actions with the
+    highest return, averaged over the worlds or measured with more or less caution (``risk``).
 
     `predict` carries the plan in SB3's recurrent state, as a warm start for the next step: pass on the state that it
     returns (`evaluate_policy` does). Without it every step is planned from scratch, which costs return.
@@ -102,9 +104,9 @@ class MPCAgent(BaseAlgorithm):
         env: the environment, its id, or a VecEnv; actions a bounded Box, observations a vector or a Dict of vectors.
         dynamics: the model to learn; or a function (observation size, action size, `ObservationSpec`) -> model, which
             is needed if the model has to predict reward or termination too, and may be called again when that is found.
-        planner: the optimiser of action sequences: a name ("cem", or what `register_planner` added), a class or
-            function that makes one, or a ready-made planner. Its settings are further arguments of the agent, except of
-            a ready-made one.
+        planner: the optimiser of action sequences: a name ("cem", "icem", "mppi", or what `register_planner` added), a
+            class or function that makes one, or a ready-made planner. Its settings are further arguments of the agent,
+            except of a ready-made one.
         reward_fn: r(s, a, s'), batched over leading dimensions, in torch. None: the environment's ``reward_fn`` or
             `compute_reward`, or what is known of Gymnasium's own; if there is none, or with "learned", the model
             predicts it.
@@ -115,9 +117,22 @@ class MPCAgent(BaseAlgorithm):
             known. For Dict observations it indexes the vector of the parts in alphabetical order.
         num_particles: worlds drawn for each plan, P, over which a return is averaged.
         actions_per_plan: actions performed of each plan before the next one is made.
+        risk: what a sequence is worth whose return is not the same in all worlds: the "mean" over them; the mean less
+            ``risk_aversion`` standard deviations ("mean-std"); the mean of the worst ``cvar_share`` of them ("cvar");
+            the "worst"; or, with optimism, the "best". A world that is not finite makes a sequence lose in any case.
+        risk_aversion: standard deviations for "mean-std"; less than zero it is optimism.
+        cvar_share: share of the worlds for "cvar", in (0, 1].
         learning_starts: transitions before the first training, of random actions if they were not logged; default:
             those of one episode in each environment (as many in all, if none is let end), or ``train_freq`` if these
             come first.
+        exploration: the random actions until then: "uniform", of each step by itself; "held", each for
+            ``exploration_hold`` steps; "coloured", uniform at each step and correlated over the steps; or "chirp", a
+            sweep from one cycle in all of these steps to one in four steps, over the whole range.
+        exploration_hold: steps for which a "held" action is performed.
+        exploration_beta: colour of "coloured" actions, whose power falls with the frequency f about as f^-beta: 1 is
+            pink, 2 red, and 0 is "uniform".
+        first_controller: in place of random actions: a function of the environment's observation, one of an environment
+            at a time, that returns an action. Beyond the bounds it is clipped. No file holds it.
         train_freq: environment steps between two trainings, for tasks that never end or whose episodes are very long
             or very short; default: one at every episode's start.
         time_budget: seconds that a plan may take, drawing its worlds included; the best plan found by then is used.
@@ -169,13 +184,20 @@ class MPCAgent(BaseAlgorithm):
         policy: str | type[BasePolicy] = "MPCPolicy",
         env: GymEnv | str | None = UNSET,
         dynamics: DynamicsModel | DynamicsFactory | None = None,
-        planner: str | PlannerFactory | Planner | None = None,
+        planner: AnyPlanner | None = None,
         reward_fn: RewardFn | Learned | None = None,
         terminated_fn: TerminatedFn | Learned | Never | None = None,
         observation_spec: ObservationSpec | None = None,
         num_particles: int = 5,
         actions_per_plan: int = 1,
+        risk: RiskName = "mean",
+        risk_aversion: float = 1.0,
+        cvar_share: float = 0.2,
         learning_starts: int | None = None,
+        exploration: ExplorationName = "uniform",
+        exploration_hold: int = 5,
+        exploration_beta: float = 1.0,
+        first_controller: FirstController | None = None,
         train_freq: int | None = None,
         time_budget: float | None = None,
         stats_window_size: int = 100,
@@ -207,8 +229,11 @@ class MPCAgent(BaseAlgorithm):
         )
         self.verbose = verbose
         self.learning_starts, self.train_freq = learning_starts, train_freq
+        self.exploration, self.first_controller = exploration, first_controller
+        self.exploration_hold, self.exploration_beta = exploration_hold, exploration_beta
         self._task_given = TaskArguments(reward_fn, terminated_fn, observation_spec)
-        self._planning_given = PlanningArguments(num_particles, actions_per_plan, time_budget)
+        measure = RiskMeasure(risk, risk_aversion, cvar_share)
+        self._planning_given = PlanningArguments(num_particles, actions_per_plan, time_budget, measure)
         self.seeds_environment = seed is not None
         self.seed = fresh_seed() if seed is None else seed
         if _init_setup_model:
@@ -260,6 +285,7 @@ class MPCAgent(BaseAlgorithm):
             self._new_dynamics(), planner, self.action_space, *self._planning_given, device=self.device
         )
         self.collector = Collector(self.store, self.n_envs, self.controller)
+        self.explorer = Explorer(self)
         self.logs = Logs(self)
         self.policy = MPCPolicy(self.observation_space, self.action_space, self)
         self._training_context: Callable[[], AbstractContextManager[None]] = nullcontext
@@ -294,7 +320,7 @@ class MPCAgent(BaseAlgorithm):
         self.task.model(reward=reward, terminated=terminated)
         self.controller.dynamics, self.num_fitted = self._new_dynamics(), 0
 
-    # Each has one owner; these are their names on the agent.
+    # Each has one owner; these are their names on the agent. Those of the controller may be set.
 
     @property
     def dynamics(self) -> DynamicsModel:
@@ -306,32 +332,12 @@ class MPCAgent(BaseAlgorithm):
         """The optimiser of action sequences."""
         return self.controller.planner
 
-    @property
-    def num_particles(self) -> int:
-        """P, worlds drawn for each plan; may be set."""
-        return self.controller.num_particles
-
-    @num_particles.setter
-    def num_particles(self, num_particles: int) -> None:
-        self.controller.num_particles = num_particles
-
-    @property
-    def actions_per_plan(self) -> int:
-        """Actions performed of each plan; may be set."""
-        return self.controller.actions_per_plan
-
-    @actions_per_plan.setter
-    def actions_per_plan(self, actions_per_plan: int) -> None:
-        self.controller.actions_per_plan = actions_per_plan
-
-    @property
-    def time_budget(self) -> float | None:
-        """Seconds that a plan may take, or None; may be set."""
-        return self.controller.time_budget
-
-    @time_budget.setter
-    def time_budget(self, time_budget: float | None) -> None:
-        self.controller.time_budget = time_budget
+    num_particles = OfController[int]()
+    actions_per_plan = OfController[int]()
+    risk = OfController[RiskName]()
+    risk_aversion = OfController[float]()
+    cvar_share = OfController[float]()
+    time_budget = OfController["float | None"]()
 
     @property
     def observation_spec(self) -> ObservationSpec:
@@ -616,8 +622,7 @@ class MPCAgent(BaseAlgorithm):
             observations = self._observations
             if self.is_exploring:
                 self._warn_of_an_endless_beginning()
-                exploration = self.generators.exploration
-                actions = np.stack([self.controller.uniform(exploration) for _ in range(self.n_envs)])
+                actions = self.explorer.actions(observations)
             else:
                 actions = self._plan(observations)
 

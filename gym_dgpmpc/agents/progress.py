@@ -16,6 +16,12 @@ if TYPE_CHECKING:
     from gym_dgpmpc.agents.mpc import MPCAgent
 
 
+MISSING_CONTROLLER = (
+    "the saved agent began with a controller of the user's, which no file holds, and this one goes on with random "
+    "actions until it has a model: pass first_controller=... to load"
+)
+
+
 class Progress:
     """The counters of an agent, and the present observations if episodes are running."""
 
@@ -26,6 +32,7 @@ class Progress:
         agent = self._agent
         state: StateDict = {"num_timesteps": agent.num_timesteps, "num_fitted": agent.num_fitted}
         state["num_episodes"] = agent._episode_num
+        state["has_first_controller"] = agent.first_controller is not None
         if agent._last_obs is not None:
             state["last_observation"] = torch.from_numpy(agent._last_obs.copy())
             state["last_episode_starts"] = torch.from_numpy(np.array(agent._last_episode_starts))
@@ -34,6 +41,8 @@ class Progress:
     def load_state_dict(self, state: StateDict) -> None:
         """Go on from `state_dict`; with another number of environments, new episodes begin.
 
+        Warns, before the first training, if the agent lacks the first controller that the saved one had.
+
         Raises:
             KeyError, ValueError: a counter is missing or out of its range.
         """
@@ -41,6 +50,8 @@ class Progress:
         agent.num_timesteps, agent.num_fitted, agent._episode_num = (
             saved_count(name, state[name]) for name in ("num_timesteps", "num_fitted", "num_episodes")
         )
+        if state.get("has_first_controller", False) and agent.first_controller is None and not agent.is_fitted:
+            warnings.warn(MISSING_CONTROLLER, stacklevel=2)
         agent.begin_at(None)
         if "last_observation" not in state:
             return

@@ -17,7 +17,13 @@ from gym_dgpmpc.settings import Setting, Settings, argument_texts, joined
 PLAIN = (
     "num_particles",
     "actions_per_plan",
+    "risk",
+    "risk_aversion",
+    "cvar_share",
     "learning_starts",
+    "exploration",
+    "exploration_hold",
+    "exploration_beta",
     "train_freq",
     "observation_spec",
     "time_budget",
@@ -29,7 +35,7 @@ PLAIN = (
 """The arguments of every agent that are plain values, each an attribute too: what a file holds beside the parts'."""
 
 
-NOT_PLAIN = ("planner", "reward_fn", "terminated_fn", "device")
+NOT_PLAIN = ("planner", "reward_fn", "terminated_fn", "first_controller", "device")
 """The others, in a named agent's signature; an `MPCAgent` has ``dynamics`` besides."""
 
 UNSET: Any = object()

@@ -30,7 +30,7 @@ AGENT_CLASSES = {
 MOST_STATES = 10**8
 """Nor may a file's arguments say that a plan holds more than that many states, H K P, at once."""
 
-NOT_PLAIN = frozenset({"policy", "env", "dynamics", "reward_fn", "terminated_fn", "device"})
+NOT_PLAIN = frozenset({"policy", "env", "dynamics", "reward_fn", "terminated_fn", "first_controller", "device"})
 """Arguments of every agent that no file holds."""
 
 

@@ -66,7 +66,7 @@ def _options() -> Iterable[inspect.Parameter]:
         yield _option(name, _choice(name, choices), text, "what is known; else learned", "Task")
 
 
-_PLANNING = ("num_particles", "actions_per_plan", "time_budget")
+_PLANNING = ("num_particles", "actions_per_plan", "risk", "risk_aversion", "cvar_share", "time_budget")
 
 
 def _option(name: str, kind: Any, text: str, default: str | bool, panel: str) -> inspect.Parameter:

@@ -22,7 +22,7 @@ class Data(NamedTuple):
 
     def rows(self, index: Int[Tensor, "n"]) -> "Data":
         """Some of the rows."""
-        return Data(self.x[index], self.y[index])
+        return Data(self.x.index_select(0, index), self.y.index_select(0, index))
 
 
 @runtime_checkable

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gym_dgpmpc.gp.layer import PARAMETERS, Layer, conditional, factorise
+from gym_dgpmpc.gp.layer import Layer, conditional, factorise
 
 NOISE_FLOOR = 1e-6
 """Lower bound of the noise variance, in standardised targets; single-precision data cannot resolve less."""
@@ -66,8 +66,8 @@ class DeepGP(NamedTuple):
     def with_parameters(self, parameters: Sequence[Tensor]) -> "DeepGP":
         """The same kernels with other tensors, given in the order of `parameters`."""
         each = iter(parameters)
-        layers = tuple(Layer(layer.kernel, *(next(each) for _ in PARAMETERS)) for layer in self.layers)
-        return DeepGP(layers, next(each))
+        layers = [Layer(layer.kernel, *(next(each) for _ in layer.parameters())) for layer in self.layers]
+        return DeepGP(tuple(layers), next(each))
 
     def at(self, chain: Int[Tensor, "n"]) -> "DeepGP":
         """The models of these chains, the same one more than once if need be."""

@@ -12,18 +12,23 @@ from typing import NamedTuple
 from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.gp.kernels import Kernel, pairwise_sqdist, scaled_sqdist
+from gym_dgpmpc.gp.kernels import Kernel, pairwise_sqdist, sqdist
 from gym_dgpmpc.gp.linalg import cholesky
-from gym_dgpmpc.gp.projection import projection
+from gym_dgpmpc.gp.projection import linear_covariance, projection
 
 
 class Layer(NamedTuple):
-    """Kernel, its hyperparameters theta, and inducing inputs Z of one layer."""
+    """Kernel, its hyperparameters theta, and inducing inputs Z of one layer.
+
+    k(x, x') = variance (r(|x - x'|^2) + sum_d slope_d^2 x_d x'_d), inputs over the lengthscales. The second term, of
+    functions that are linear, is there if ``log_slope`` is given.
+    """
 
     kernel: Kernel
     inducing_inputs: Float[Tensor, "*c M D"]
     log_lengthscale: Float[Tensor, "*c D"]
     log_variance: Float[Tensor, "*c"]
+    log_slope: Float[Tensor, "*c D"] | None = None
 
     @property
     def lengthscale(self) -> Tensor:
@@ -33,18 +38,24 @@ class Layer(NamedTuple):
     def variance(self) -> Tensor:
         return self.log_variance.exp()
 
+    @property
+    def slope_variance(self) -> Tensor | None:
+        """Of the linear part, over ``variance``."""
+        return None if self.log_slope is None else (2.0 * self.log_slope).exp()
+
     def parameters(self) -> dict[str, Tensor]:
-        """Every tensor by name."""
-        return {name: getattr(self, name) for name in PARAMETERS}
+        """Every tensor by name: what training moves and states hold; the kernel is a setting."""
+        return {name: value for name, value in self._asdict().items() if isinstance(value, Tensor)}
 
 
-PARAMETERS = ("inducing_inputs", "log_lengthscale", "log_variance")
-"""The tensors of a `Layer`, which training moves and states hold; the kernel is a setting."""
+def parameter_shapes(num_inducing: int, input_size: int, *, linear: bool = False) -> dict[str, tuple[int, ...]]:
+    """The shape of each of the parameters of a layer with M inducing inputs of D numbers.
 
-
-def parameter_shapes(num_inducing: int, input_size: int) -> dict[str, tuple[int, ...]]:
-    """The shape of each of the `PARAMETERS` of a layer with M inducing inputs of D numbers."""
-    return dict(zip(PARAMETERS, ((num_inducing, input_size), (input_size,), ()), strict=True))
+    Args:
+        linear: its kernel has a linear part.
+    """
+    shapes = {"inducing_inputs": (num_inducing, input_size), "log_lengthscale": (input_size,), "log_variance": ()}
+    return shapes | ({"log_slope": (input_size,)} if linear else {})
 
 
 def factorise(layer: Layer) -> Float[Tensor, "*c M M"]:
@@ -53,8 +64,10 @@ def factorise(layer: Layer) -> Float[Tensor, "*c M M"]:
     Raises:
         FactorisationError: see `linalg.cholesky`.
     """
-    z = layer.inducing_inputs
-    unit = layer.kernel.correlation(scaled_sqdist(z, z, layer.lengthscale))
+    z = layer.inducing_inputs / layer.lengthscale.unsqueeze(-2)
+    unit = layer.kernel.correlation(sqdist(z, z))
+    if layer.slope_variance is not None:
+        unit = unit + linear_covariance(z, z, layer.slope_variance)
     return _matrix(layer.variance.sqrt()) * cholesky(unit, unit.new_ones(()))
 
 
@@ -70,7 +83,8 @@ def conditional(
     """
     projected = project(layer, factor, x)
     # The kernel's variance enters here and not in the large matrix, which training differentiates through.
-    variance = layer.variance.unsqueeze(-1) * (1.0 - projected.square().sum(-2))
+    own = _own_variance(layer, x)
+    variance = layer.variance.unsqueeze(-1) * (own - projected.square().sum(-2))
     return _matrix(layer.variance.sqrt()) * (projected.mT @ whitened), variance.clamp_min(0.0)
 
 
@@ -82,13 +96,16 @@ def joint_conditional(
 ) -> tuple[Float[Tensor, "*p n O"], Float[Tensor, "*p n n"]]:
     """As `conditional`, with the full covariance of the n points: k_xx' - k_xz K_zz^-1 k_zx'."""
     projected = project(layer, factor, x)
-    prior = layer.kernel.correlation(pairwise_sqdist(x / layer.lengthscale.unsqueeze(-2)))
+    scaled = x / layer.lengthscale.unsqueeze(-2)
+    prior = layer.kernel.correlation(pairwise_sqdist(scaled))
+    if layer.slope_variance is not None:
+        prior = prior + linear_covariance(scaled, scaled, layer.slope_variance)
     covariance = _matrix(layer.variance) * (prior - projected.mT @ projected)
     return _matrix(layer.variance.sqrt()) * (projected.mT @ whitened), covariance
 
 
 def project(layer: Layer, factor: Float[Tensor, "*c M M"], x: Float[Tensor, "*p n D"]) -> Float[Tensor, "*p M n"]:
-    """L_z^-1 k_zx / sigma, of which every column has a length of at most one.
+    """L_z^-1 k_zx / sigma; without a linear part every column has a length of at most one.
 
     Args:
         factor: `factorise` of this very layer. Gradients with respect to the layer are complete without any flowing
@@ -96,7 +113,14 @@ def project(layer: Layer, factor: Float[Tensor, "*c M M"], x: Float[Tensor, "*p 
     """
     lengthscale = layer.lengthscale.unsqueeze(-2)
     unit = (factor / _matrix(layer.variance.sqrt())).detach()
-    return projection(layer.kernel, x / lengthscale, layer.inducing_inputs / lengthscale, unit)
+    return projection(layer.kernel, x / lengthscale, layer.inducing_inputs / lengthscale, unit, layer.slope_variance)
+
+
+def _own_variance(layer: Layer, x: Float[Tensor, "*p n D"]) -> Float[Tensor, "*p n"] | float:
+    """k(x, x) over the variance."""
+    if layer.slope_variance is None:
+        return 1.0
+    return 1.0 + ((x / layer.lengthscale.unsqueeze(-2)).square() * layer.slope_variance.unsqueeze(-2)).sum(-1)
 
 
 def _matrix(scale: Float[Tensor, "*c"]) -> Float[Tensor, "*c 1 1"]:

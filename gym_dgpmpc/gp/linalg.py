@@ -1,5 +1,8 @@
 """The only Cholesky factorisation of the package, and its only jitter."""
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -12,8 +15,23 @@ JITTER = 1e-6
 _LADDER = (1.0, 10.0, 100.0, 1e3, 1e4)
 
 
+Factorise = Callable[[Tensor, Any], tuple[Tensor, bool]]
+"""From symmetric matrices, and what is to be added to their diagonals, to lower factors, and whether there are any."""
+
+
+def by_lapack(covariance: Float[Tensor, "*b n n"], added: float | Tensor) -> tuple[Float[Tensor, "*b n n"], bool]:
+    """The factor of ``covariance + added * I``, and whether there is one."""
+    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
+    factor, info = torch.linalg.cholesky_ex(covariance + added * eye)
+    # LAPACK lets an infinite diagonal pass; some builds of it a NaN too. Either shows in the factor's diagonal.
+    return factor, not bool(info.any()) and bool(factor.diagonal(dim1=-2, dim2=-1).isfinite().all())
+
+
 def cholesky(
-    covariance: Float[Tensor, "*b n n"], scale: Float[Tensor, ""] | Float[Tensor, "*b 1 1"], jitter: float = JITTER
+    covariance: Float[Tensor, "*b n n"],
+    scale: float | Float[Tensor, ""] | Float[Tensor, "*b 1 1"] = 1.0,
+    jitter: float = JITTER,
+    factorise: Factorise = by_lapack,
 ) -> Float[Tensor, "*b n n"]:
     """Lower Cholesky factor of ``covariance + jitter * scale * I``, differentiable.
 
@@ -22,16 +40,14 @@ def cholesky(
     Args:
         covariance: symmetric and positive semi-definite up to rounding.
         scale: the kernel's variance, which the jitter is relative to; of all matrices, or of each.
+        factorise: what gives the factor.
 
     Raises:
         FactorisationError: the matrix is not finite, or not positive definite with the largest jitter.
     """
-    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
     for rung in _LADDER:
-        jittered = covariance + (rung * jitter * scale) * eye if jitter else covariance
-        factor, info = torch.linalg.cholesky_ex(jittered)
-        # LAPACK lets an infinite diagonal pass; some builds of it a NaN too. Either shows in the factor's diagonal.
-        if not bool(info.any()) and bool(factor.diagonal(dim1=-2, dim2=-1).isfinite().all()):
+        factor, exists = factorise(covariance, rung * jitter * scale)
+        if exists:
             return factor
     finite = bool(torch.isfinite(covariance).all())
     raise FactorisationError(

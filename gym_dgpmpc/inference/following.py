@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gym_dgpmpc.data.standardised import Data, DataSource
-from gym_dgpmpc.gp.deep_gp import Factorised
-from gym_dgpmpc.inference.gradients import Passed, forward, layer_terms
+from gym_dgpmpc.gp.deep_gp import DeepGP
+from gym_dgpmpc.inference.gradients import forward, prepare
 from gym_dgpmpc.inference.last_layer import LastLayerEvidence, last_layer_evidence
 from gym_dgpmpc.inference.latents import move_latents, with_latents
 
@@ -37,18 +37,18 @@ class Follower:
     """Keeps the sum over all whole blocks of rows.
 
     Args:
-        factorised: C models, which stay.
+        model: of C chains, which stays.
         inner: inducing outputs of the inner layers, which stay.
+        compile: see `gradients.prepare`.
     """
 
-    def __init__(self, factorised: Factorised, inner: Float[Tensor, "C I"]):
-        self._factorised, self._inner = factorised, inner
-        self._terms = layer_terms(factorised)
+    def __init__(self, model: DeepGP, inner: Float[Tensor, "C I"], *, compile: bool = True):
+        self._prepared, self._inner = prepare(model, compile=compile), inner
         # What the last layer is fed does not depend on where it is itself.
-        rest = inner.new_zeros(len(inner), factorised.model.num_whitened() - inner.shape[1])
-        self._whitened = factorised.model.split(torch.cat([inner, rest], dim=1))
-        chains, targets = factorised.model.log_noise.shape
-        size = factorised.model.layers[-1].inducing_inputs.shape[-2]
+        rest = inner.new_zeros(len(inner), model.num_whitened() - inner.shape[1])
+        self._whitened = model.split(torch.cat([inner, rest], dim=1))
+        chains, targets = model.log_noise.shape
+        size = model.layers[-1].inducing_inputs.shape[-2]
         self._sum = LastLayerEvidence(
             inner.new_zeros(chains, targets, size, size), inner.new_zeros(chains, targets, size)
         )
@@ -80,17 +80,15 @@ class Follower:
         rows = data.rows(torch.arange(begin, data.num_rows, dtype=torch.int64, device=position.device))
         # Of what the sum does not hold yet.
         recent = [latent[:, begin:] for latent in grown]
-        passed = None
         if unsettled < data.num_rows:
-            moving = [latent[:, unsettled - begin :] for latent in recent]
-            passed = self._move(position, _part(rows, unsettled - begin), moving, generator).since(whole - unsettled)
+            self._move(position, _part(rows, unsettled - begin), [e[:, unsettled - begin :] for e in recent], generator)
         total = self._sum
         for first in range(0, whole - begin, BLOCK):
-            total = self._evidence(_part(rows, first, first + BLOCK), recent, first, total)
+            total = total.plus(self._evidence(rows, recent, first, first + BLOCK))
         evidence = total
         if whole < data.num_rows:
-            evidence = self._evidence(_part(rows, whole - begin), recent, whole - begin, total, passed)
-        positions = evidence.posterior().positions(self._inner, num_samples, generator)
+            evidence = total.plus(self._evidence(rows, recent, whole - begin, data.num_rows - begin))
+        positions = evidence.posterior(self._prepared.factorise).positions(self._inner, num_samples, generator)
         self._sum, self._num_summed = total, whole
         return Followed(positions, grown, rows.y)
 
@@ -100,28 +98,21 @@ class Follower:
         batch: Data,
         latents: Sequence[Float[Tensor, "C n D"]],
         generator: torch.Generator,
-    ) -> Passed:
-        """One Metropolis step of the latents of these rows, in place; the rows as they then pass the last layer."""
-        whitened = self._factorised.model.split(position)
-        passed, moved = move_latents(self._factorised, self._terms, whitened, batch, latents, generator)
+    ) -> None:
+        """One Metropolis step of the latents of these rows, in place."""
+        whitened, present = self._prepared.model.split(position), [latent.to(position) for latent in latents]
+        _, moved = move_latents(self._prepared, whitened, batch, present, generator)
         for latent, new in zip(latents, moved, strict=True):
             latent.copy_(new)
-        return passed[-1]
 
     def _evidence(
-        self,
-        batch: Data,
-        latents: Sequence[Float[Tensor, "C n D"]],
-        first: int,
-        others: LastLayerEvidence,
-        passed: Passed | None = None,
+        self, rows: Data, latents: Sequence[Float[Tensor, "C n D"]], first: int, end: int
     ) -> LastLayerEvidence:
-        """Of the others and these rows, whose latents begin at ``first``; how they pass may be known already."""
-        if passed is None:
-            x = batch.x.expand(len(self._inner), -1, -1)
-            own = [latent[:, first : first + batch.num_rows].to(x) for latent in latents]
-            passed = forward(self._terms, self._whitened, x, own)[-1]
-        return last_layer_evidence(self._factorised, self._terms[-1], passed, batch.y, others=others)
+        """Of the rows from ``first`` to ``end``."""
+        batch = _part(rows, first, end)
+        x = batch.x.expand(len(self._inner), -1, -1)
+        passed = forward(self._prepared, self._whitened, x, [latent[:, first:end].to(x) for latent in latents])
+        return last_layer_evidence(self._prepared, passed[-1], batch.y)
 
 
 def _whole(num_rows: int) -> int:

@@ -2,7 +2,7 @@
 
 What `sampler.py` calls at every step. Automatic differentiation of `gp.deep_gp.propagate` gives the same numbers (a
 test compares them) at several times the cost: here one factorisation, and its inverse, serve every evaluation until the
-hyperparameters move again, and a gradient that is not wanted costs nothing.
+hyperparameters move again, and a gradient that is not wanted costs nothing. `layers.py` has what a layer does.
 
 The model, layer by layer, of a datum x with the latents e_l ~ N(0, I) of its inner layers:
 
@@ -15,51 +15,33 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.gp.deep_gp import Factorised, log_likelihood
-from gym_dgpmpc.gp.kernels import Kernel, sqdist
+from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, log_likelihood
+from gym_dgpmpc.gp.linalg import Factorise, by_lapack
+from gym_dgpmpc.inference import compiled_layers
+from gym_dgpmpc.inference.layers import LayerTerms, Passed, Seen, layer_gradients, layer_terms, moments, see
 
 LEAST_VARIANCE = 1e-12
 """Of an inner layer, so that the square root's gradient stays finite where the variance vanishes."""
 
 
-class LayerTerms(NamedTuple):
-    """What all evaluations under the same hyperparameters share of a layer."""
+class Prepared(NamedTuple):
+    """A model of C chains, with what all evaluations under its hyperparameters share."""
 
-    kernel: Kernel
-    lengthscale: Float[Tensor, "C 1 D"]
-    variance: Float[Tensor, "C 1 1"]
-    centres: Float[Tensor, "C M D"]
-    """Inducing inputs over the lengthscales."""
-    inverse: Float[Tensor, "C M M"]
-    """L^-1 of the correlations, L L^T = r(Z, Z) + jitter."""
-    own_slope: Float[Tensor, "C M M"]
-    """dk/d(r^2) between the inducing inputs."""
+    model: DeepGP
+    layers: list[LayerTerms]
 
+    @property
+    def factorise(self) -> Factorise:
+        """How matrices of such models are factorised."""
+        return by_lapack if self.layers[0].compiled is None else compiled_layers.factorise
 
-class Seen(NamedTuple):
-    """n points of each chain, seen by a layer."""
-
-    scaled: Float[Tensor, "C n D"]
-    projected: Float[Tensor, "C M n"]
-    """A = L^-1 r(Z, x)."""
-    slope: Float[Tensor, "C n M"]
-
-
-class Passed(NamedTuple):
-    """n points of each chain, passed through a layer."""
-
-    seen: Seen
-    mean: Float[Tensor, "C n O"]
-    variance: Float[Tensor, "C n"]
-
-    def since(self, first: int) -> "Passed":
-        """The points from ``first`` on."""
-        scaled, projected, slope = self.seen
-        seen = Seen(scaled[:, first:], projected[..., first:], slope[:, first:])
-        return Passed(seen, self.mean[:, first:], self.variance[:, first:])
+    @property
+    def factorised(self) -> Factorised:
+        """The model as the rest of the package takes it."""
+        return Factorised(self.model, [layer.variance.sqrt() * layer.factor for layer in self.layers])
 
 
 class Gradients(NamedTuple):
@@ -70,42 +52,25 @@ class Gradients(NamedTuple):
     """In the order of `DeepGP.parameters`; None where they were not wanted."""
 
 
-def layer_terms(factorised: Factorised) -> list[LayerTerms]:
-    """The terms of every layer."""
-    terms = []
-    for layer, factor in zip(factorised.model.layers, factorised.factors, strict=True):
-        variance = layer.variance[:, None, None]
-        lengthscale = layer.lengthscale.unsqueeze(-2)
-        centres = layer.inducing_inputs / lengthscale
-        _, own_slope = layer.kernel.correlation_and_slope(sqdist(centres, centres))
-        eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
-        unit = factor / variance.sqrt()
-        inverse = torch.linalg.solve_triangular(unit, eye.expand_as(unit), upper=False)
-        terms.append(LayerTerms(layer.kernel, lengthscale, variance, centres, inverse, own_slope))
-    return terms
+def prepare(model: DeepGP, *, compile: bool = True) -> Prepared:
+    """Factorise the layers.
+
+    Args:
+        compile: evaluate in compiled code, where there is any for this machine and these kernels.
+
+    Raises:
+        FactorisationError: see `linalg.cholesky`.
+    """
+    return Prepared(model, [layer_terms(layer, compile=compile) for layer in model.layers])
 
 
-def see(terms: LayerTerms, x: Float[Tensor, "C n D"]) -> Seen:
-    """What a layer needs of its inputs."""
-    scaled = x / terms.lengthscale
-    value, slope = terms.kernel.correlation_and_slope(sqdist(scaled, terms.centres))
-    return Seen(scaled, terms.inverse @ value.mT, slope)
-
-
-def moments(terms: LayerTerms, whitened: Float[Tensor, "C M O"], seen: Seen, least: float) -> Passed:
-    """Conditional mean and variance, the latter not below ``least``."""
-    mean = terms.variance.sqrt() * (seen.projected.mT @ whitened)
-    variance = terms.variance.squeeze(-1) * (1.0 - seen.projected.square().sum(-2))
-    return Passed(seen, mean, variance.clamp_min(least))
-
-
-def pass_first(terms: Sequence[LayerTerms], whitened: Float[Tensor, "C M O"], seen: Seen) -> Passed:
-    """The points through the first of these layers, which may be the last."""
-    return moments(terms[0], whitened, seen, 0.0 if len(terms) == 1 else LEAST_VARIANCE)
+def pass_first(prepared: Prepared, whitened: Float[Tensor, "C M O"], seen: Seen) -> Passed:
+    """The points through the first of the layers, which may be the last."""
+    return moments(prepared.layers[0], whitened, seen, 0.0 if len(prepared.layers) == 1 else LEAST_VARIANCE)
 
 
 def forward(
-    terms: Sequence[LayerTerms],
+    prepared: Prepared,
     whitened: Sequence[Tensor],
     x: Float[Tensor, "C n D"],
     latents: Sequence[Float[Tensor, "C n D"]],
@@ -117,33 +82,21 @@ def forward(
         latents: e_l of each inner layer.
         first: how ``x`` passes the first layer, if that is known already.
     """
-    passed = [first or pass_first(terms, whitened[0], see(terms[0], x))]
-    for index, (layer, v) in enumerate(zip(terms[1:], whitened[1:], strict=True), 1):
-        x = x + passed[-1].mean + passed[-1].variance.sqrt().unsqueeze(-1) * latents[index - 1]
-        passed.append(moments(layer, v, see(layer, x), 0.0 if index == len(terms) - 1 else LEAST_VARIANCE))
+    layers = prepared.layers
+    passed = [first or pass_first(prepared, whitened[0], see(layers[0], x))]
+    for index, (layer, v) in enumerate(zip(layers[1:], whitened[1:], strict=True), 1):
+        x = torch.addcmul(x + passed[-1].mean, passed[-1].variance.sqrt().unsqueeze(-1), latents[index - 1])
+        passed.append(moments(layer, v, see(layer, x), 0.0 if index == len(layers) - 1 else LEAST_VARIANCE))
     return passed
 
 
-def likelihood(factorised: Factorised, passed: Sequence[Passed], y: Float[Tensor, "n T"]) -> Float[Tensor, "C n"]:
+def likelihood(prepared: Prepared, passed: Sequence[Passed], y: Float[Tensor, "n T"]) -> Float[Tensor, "C n"]:
     """log p(y | inducing outputs, latents) of each point: the last layer integrated out, given its inputs."""
-    return log_likelihood(factorised.model, passed[-1].mean, passed[-1].variance, y)
-
-
-def choose(first_one: Bool[Tensor, "C n"], one: Passed, other: Passed) -> Passed:
-    """Each point as it passed a layer one way or the other."""
-    by_row, by_column = first_one.unsqueeze(-1), first_one.unsqueeze(1)
-    seen = Seen(
-        torch.where(by_row, one.seen.scaled, other.seen.scaled),
-        torch.where(by_column, one.seen.projected, other.seen.projected),
-        torch.where(by_row, one.seen.slope, other.seen.slope),
-    )
-    variance = torch.where(first_one, one.variance, other.variance)
-    return Passed(seen, torch.where(by_row, one.mean, other.mean), variance)
+    return log_likelihood(prepared.model, passed[-1].mean, passed[-1].variance, y)
 
 
 def gradients(
-    factorised: Factorised,
-    terms: Sequence[LayerTerms],
+    prepared: Prepared,
     whitened: Sequence[Tensor],
     passed: Sequence[Passed],
     latents: Sequence[Float[Tensor, "C n D"]],
@@ -158,7 +111,7 @@ def gradients(
         latents: that it was given.
         of_parameters: whether those of the hyperparameters and inducing inputs are wanted too.
     """
-    num_points, model = len(y), factorised.model
+    num_points, model = len(y), prepared.model
     noise = model.noise_variance.unsqueeze(-2)
     total = passed[-1].variance.unsqueeze(-1) + noise
     residual = (y - passed[-1].mean) / total
@@ -170,40 +123,15 @@ def gradients(
     whitened_bar: list[Tensor] = []
     parameters_bar: list[Tensor] = [noise_bar]
     through = None  # the gradient of the layer's output that comes from the layers above it, past their means
-    for index in reversed(range(len(terms))):
-        layer, v, (seen, mean, variance) = terms[index], whitened[index], passed[index]
-        scale = layer.variance.sqrt()
-        whitened_bar.append(scale * (seen.projected @ mean_bar))
-        if index == 0 and not of_parameters:
-            break
-        projected_bar = scale * (v @ mean_bar.mT) - 2.0 * layer.variance * seen.projected * variance_bar.unsqueeze(-2)
-        by_distance = (layer.inverse.mT @ projected_bar).mT * seen.slope
-        # d |x_i - z_j|^2 / d x_i = 2 (x_i - z_j), summed over the j.
-        scaled_bar = 2.0 * (by_distance.sum(-1, keepdim=True) * seen.scaled - by_distance @ layer.centres)
-        if of_parameters:
-            centres_bar = _centres_gradient(layer, seen, by_distance, projected_bar)
-            log_lengthscale_bar = -((centres_bar * layer.centres).sum(-2) + (scaled_bar * seen.scaled).sum(-2))
-            log_variance_bar = 0.5 * (mean_bar * mean).sum((-2, -1)) + (variance_bar * variance).sum(-1)
-            parameters_bar = [centres_bar / layer.lengthscale, log_lengthscale_bar, log_variance_bar, *parameters_bar]
-        if index:
+    for index in reversed(range(len(passed))):
+        layer, wanted = prepared.layers[index], {"of_points": index > 0, "of_parameters": of_parameters}
+        found = layer_gradients(layer, whitened[index], passed[index], mean_bar, variance_bar, **wanted)
+        whitened_bar.append(found.whitened)
+        parameters_bar = [*(found.parameters or ()), *parameters_bar]
+        if found.points is not None:
             # Onto what the layer below gave: through this layer, and past it, whose mean function is the identity.
-            mean_bar = scaled_bar / layer.lengthscale
-            through = mean_bar = mean_bar if through is None else mean_bar + through
+            through = mean_bar = found.points if through is None else found.points + through
             below = passed[index - 1].variance
             variance_bar = 0.5 * (mean_bar * latents[index - 1]).sum(-1) / below.sqrt()
     flat = torch.cat([bar.flatten(-2) for bar in reversed(whitened_bar)], dim=-1)
     return Gradients(flat, parameters_bar if of_parameters else None)
-
-
-def _centres_gradient(
-    layer: LayerTerms, seen: Seen, by_distance: Float[Tensor, "C n M"], projected_bar: Float[Tensor, "C M n"]
-) -> Float[Tensor, "C M D"]:
-    """Of the scaled inducing inputs: as `gp.projection` has it, which says where it comes from."""
-    centres = layer.centres
-    points = by_distance.sum(-2).unsqueeze(-1) * centres - by_distance.mT @ seen.scaled
-    lower = (projected_bar @ seen.projected.mT).tril()
-    lower.diagonal(dim1=-2, dim2=-1).mul_(0.5)
-    covariance_bar = -(layer.inverse.mT @ lower @ layer.inverse)
-    by_own_distance = 0.5 * (covariance_bar + covariance_bar.mT) * layer.own_slope
-    own = by_own_distance.sum(-1, keepdim=True) * centres - by_own_distance @ centres
-    return 2.0 * points + 4.0 * own

@@ -14,9 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gym_dgpmpc.errors import FactorisationError
-from gym_dgpmpc.gp.deep_gp import Factorised
-from gym_dgpmpc.gp.linalg import cholesky
-from gym_dgpmpc.inference.gradients import LayerTerms, Passed
+from gym_dgpmpc.gp.linalg import Factorise, by_lapack, cholesky
+from gym_dgpmpc.inference.gradients import Prepared
+from gym_dgpmpc.inference.layers import Passed, gram
 
 
 class LastLayerPosterior(NamedTuple):
@@ -46,7 +46,11 @@ class LastLayerEvidence(NamedTuple):
     precision: Float[Tensor, "C T M M"]
     moment: Float[Tensor, "C T M"]
 
-    def posterior(self) -> LastLayerPosterior:
+    def plus(self, other: "LastLayerEvidence") -> "LastLayerEvidence":
+        """Of both data."""
+        return LastLayerEvidence(self.precision + other.precision, self.moment + other.moment)
+
+    def posterior(self, factorise: Factorise = by_lapack) -> LastLayerPosterior:
         """With the standard normal prior.
 
         Raises:
@@ -55,7 +59,7 @@ class LastLayerEvidence(NamedTuple):
         """
         prior = torch.eye(self.moment.shape[-1], dtype=self.moment.dtype, device=self.moment.device)
         # No eigenvalue lies below the prior's one, so no jitter is needed.
-        factor = cholesky(self.precision + prior, self.moment.new_ones(()), jitter=0.0)
+        factor = cholesky(self.precision + prior, jitter=0.0, factorise=factorise)
         mean = torch.cholesky_solve(self.moment.unsqueeze(-1), factor).squeeze(-1)
         if not bool(mean.isfinite().all()):  # targets are in the moment alone
             raise FactorisationError(
@@ -65,29 +69,18 @@ class LastLayerEvidence(NamedTuple):
 
 
 def last_layer_evidence(
-    factorised: Factorised,
-    terms: LayerTerms,
-    passed: Passed,
-    y: Float[Tensor, "n T"],
-    weight: float = 1.0,
-    others: LastLayerEvidence | None = None,
+    prepared: Prepared, passed: Passed, y: Float[Tensor, "n T"], weight: float = 1.0
 ) -> LastLayerEvidence:
     """Bayesian linear regression on a_n = L_z^-1 k_zn whose datum n has the noise s_n = k_nn - |a_n|^2 + noise.
 
     precision = sum_n a_n a_n^T / s_n,  moment = sum_n a_n y_n / s_n, under the likelihood of `deep_gp.log_likelihood`.
 
     Args:
-        terms, passed: of the last layer.
+        passed: of the last layer.
         weight: how often each datum counts: N / n where the rows are a subset of the data.
-        others: what other data say, which is added.
     """
-    a = terms.variance.sqrt() * passed.seen.projected
-    noise = factorised.model.noise_variance
+    layer, noise = prepared.layers[-1], prepared.model.noise_variance
     weights = weight / (passed.variance.unsqueeze(1) + noise.unsqueeze(-1))  # "C T n"
-    weighted = a.unsqueeze(1) * weights.unsqueeze(2)
-    moment = (weighted @ y.mT.unsqueeze(-1)).squeeze(-1)
-    if others is None:
-        return LastLayerEvidence(weighted @ a.mT.unsqueeze(1), moment)
-    # In one product for all targets of a chain, and no more passes over the large matrices.
-    precision = torch.baddbmm(others.precision.flatten(1, 2), weighted.flatten(1, 2), a.mT)
-    return LastLayerEvidence(precision.view_as(others.precision), others.moment + moment)
+    # a_n is the projected datum times the kernel's standard deviation.
+    precision = gram(layer, passed.seen, layer.variance * weights)
+    return LastLayerEvidence(precision, layer.variance.sqrt() * ((weights * y.mT) @ passed.seen.projected.mT))

@@ -11,8 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gym_dgpmpc.data.standardised import Data
-from gym_dgpmpc.gp.deep_gp import Factorised
-from gym_dgpmpc.inference.gradients import LayerTerms, Passed, choose, forward, likelihood, pass_first, see
+from gym_dgpmpc.inference.gradients import Prepared, forward, likelihood, pass_first
+from gym_dgpmpc.inference.layers import Passed, choose, see
+from gym_dgpmpc.randomness import quick_normals
 
 PROPOSALS = (0.0, 0.9, 0.99)
 """Correlations of a proposed latent with the present one: far, near and nearer, for data that say little or much."""
@@ -31,8 +32,7 @@ def with_latents(
 
 
 def move_latents(
-    factorised: Factorised,
-    terms: Sequence[LayerTerms],
+    prepared: Prepared,
     whitened: Sequence[Tensor],
     batch: Data,
     latents: Sequence[Float[Tensor, "C n D"]],
@@ -45,21 +45,21 @@ def move_latents(
     (preconditioned Crank-Nicolson; Cotter et al. 2013). r is one of `PROPOSALS`.
 
     Args:
-        latents: as they are kept; what is proposed is rounded to their precision.
         first: the points as they pass the first layer, which no latent comes before, if that is known already.
     """
     x = batch.x.expand(len(whitened[0]), -1, -1)
-    first = first or pass_first(terms, whitened[0], see(terms[0], x))
+    first = first or pass_first(prepared, whitened[0], see(prepared.layers[0], x))
     if not latents:
         return [first], []
     correlation = PROPOSALS[int(torch.randint(len(PROPOSALS), (1,), generator=generator, device=generator.device))]
     proposed = []
     for latent in latents:
-        fresh = torch.randn(latent.shape, generator=generator, dtype=x.dtype, device=latent.device)
-        proposed.append((correlation * latent + math.sqrt(1.0 - correlation**2) * fresh).to(latent.dtype))
-    ways = [forward(terms, whitened, x, [e.to(x.dtype) for e in each], first) for each in (latents, proposed)]
-    present, other = (likelihood(factorised, way, batch.y) for way in ways)
+        fresh = quick_normals(latent.shape, latent, generator)
+        proposed.append(fresh.mul_(math.sqrt(1.0 - correlation**2)).add_(latent, alpha=correlation))
+    ways = [forward(prepared, whitened, x, each, first) for each in (latents, proposed)]
+    present, other = (likelihood(prepared, way, batch.y) for way in ways)
     uniform = torch.rand(present.shape, generator=generator, dtype=present.dtype, device=present.device)
     accepted = uniform.log() < other - present
-    passed = [first, *(choose(accepted, new, old) for old, new in zip(*(way[1:] for way in ways), strict=True))]
+    above = zip(prepared.layers[1:], *(way[1:] for way in ways), strict=True)
+    passed = [first, *(choose(layer, accepted, new, old) for layer, old, new in above)]
     return passed, [torch.where(accepted.unsqueeze(-1), new, old) for old, new in zip(latents, proposed, strict=True)]

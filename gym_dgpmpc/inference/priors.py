@@ -19,6 +19,9 @@ LARGEST = 15.0
 """Of the logarithm of a variance that is plausible, five standard deviations from the centre: three million."""
 
 INNER_VARIANCE = 0.01
+SLOPE = 0.5
+"""Of the last layer's linear part, so that at a typical point its variance is a quarter of the other part's."""
+
 NOISE_VARIANCE = 0.05
 
 
@@ -35,6 +38,7 @@ def log_variance_centre(*, last: bool) -> float:
 def are_plausible(model: DeepGP) -> bool:
     """Whether kernel and noise variances are finite and not absurd. Long lengthscales, and no noise, are no fault."""
     variances = [layer.log_variance for layer in model.layers] + [model.log_noise]
+    variances += [2.0 * layer.log_slope for layer in model.layers if layer.log_slope is not None]
     return all(bool((value < LARGEST).all()) for value in variances)
 
 
@@ -49,4 +53,6 @@ def log_prior_gradient(model: DeepGP) -> list[Tensor]:
             (centre - layer.log_lengthscale) / WIDTH**2,
             (log_variance_centre(last=last) - layer.log_variance) / WIDTH**2,
         ]
+        if layer.log_slope is not None:
+            by_parameter.append((math.log(SLOPE) - layer.log_slope) / WIDTH**2)
     return [*by_parameter, (math.log(NOISE_VARIANCE) - model.log_noise) / WIDTH**2]

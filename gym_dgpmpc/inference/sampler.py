@@ -15,39 +15,30 @@ With ``hyperparameters="optimised"``, the default, theta follows the moving-wind
 Adam steps under positions of the latest SG-HMC steps.
 """
 
-import copy
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from gym_dgpmpc.data.standardised import Data, DataSource
-from gym_dgpmpc.gp.deep_gp import DeepGP, factorise_all
-from gym_dgpmpc.inference import sghmc
-from gym_dgpmpc.inference.adam import adam_memory
-from gym_dgpmpc.inference.gradients import (
-    Gradients,
-    Passed,
-    Seen,
-    forward,
-    gradients,
-    layer_terms,
-    likelihood,
-    pass_first,
-    see,
-)
+from gym_dgpmpc.gp.deep_gp import DeepGP
+from gym_dgpmpc.inference import adam, sghmc
+from gym_dgpmpc.inference.adam import AdamState
+from gym_dgpmpc.inference.gradients import Gradients, forward, gradients, likelihood, pass_first, prepare
 from gym_dgpmpc.inference.last_layer import last_layer_evidence
 from gym_dgpmpc.inference.latents import move_latents, with_latents
+from gym_dgpmpc.inference.layers import Passed, Seen, see
 from gym_dgpmpc.inference.priors import log_prior_gradient
 from gym_dgpmpc.inference.settings import InferenceSettings
 from gym_dgpmpc.inference.sghmc import SGHMCState
+from gym_dgpmpc.randomness import quick_normals
 
 LAST_LEARNING_RATE = 1 / 6
 """Adam's learning rate at the end of its iterations, as a share of that at their start; it falls geometrically."""
 
-MOST_TURNED, MOST_HEATED = 0.25, 0.1
+MOST_TURNED, MOST_HEATED = 0.03, 0.1
 """See `step_sizes`: of the squared angle that a step turns, and of the variance that minibatches add."""
 
 
@@ -96,6 +87,7 @@ class Chains:
             hyperparameters are moved by SG-HMC, "optimised" ones by Adam as before.
         settled: the hyperparameters come from a training before, so that Adam begins with its last learning rate.
         scale: what all steps of ``settings``, and their bounds, are multiplied by; below one after a divergence.
+        compile: see `gradients.prepare`.
     """
 
     def __init__(
@@ -108,34 +100,34 @@ class Chains:
         *,
         settled: bool = False,
         scale: float = 1.0,
+        compile: bool = True,
     ):
         self._kernels, self.data, self.settings, self._num_burn_in = model, data, settings, num_burn_in
-        self._settled, self.scale = settled, scale
+        self._settled, self.scale, self._compile = settled, scale, compile
         self.state = state
-        self._flat = state.parameters.position.clone()
-        self._optimiser = torch.optim.Adam([self._flat], lr=settings.learning_rate)
-        self._optimiser.state[self._flat] = adam_memory(self._flat)
-        self._window = self._flat.new_empty(settings.window_size, *state.whitened.position.shape)
+        self._adam = adam.init(state.parameters.position)
+        position = state.whitened.position
+        self._window = position.new_empty(settings.window_size, *position.shape)
         self.iteration = 0
-        self.value = self._flat.new_zeros(state.num_chains)
+        self.value = position.new_zeros(state.num_chains)
         """The last negative log likelihood per observation, on a minibatch, of each chain."""
         self._refactorise()
 
     @property
     def model(self) -> DeepGP:
         """The present hyperparameters."""
-        return self.factorised.model
+        return self.prepared.model
 
     def _refactorise(self) -> None:
-        self.factorised = factorise_all(with_flat(self._kernels, self.state.parameters.position))
-        self._terms = layer_terms(self.factorised)
+        model = with_flat(self._kernels, self.state.parameters.position)
+        self.prepared = prepare(model, compile=self._compile)
         self._seen: Seen | None = None
 
     def evaluate(self, generator: torch.Generator) -> float:
         """The negative log likelihood per observation where the chains are, on a minibatch; moves nothing."""
         batch, index = self._batch(self.settings.batch_size, generator)
         passed, _ = self._pass(self.state.whitened.position, batch, index, generator, move=False)
-        return -float(likelihood(self.factorised, passed, batch.y).mean())
+        return -float(likelihood(self.prepared, passed, batch.y).mean())
 
     def step(self, generator: torch.Generator, *, frozen: bool = False) -> None:
         """One SG-HMC step of the inducing outputs; now and then one of the hyperparameters, and one exact draw.
@@ -150,7 +142,7 @@ class Chains:
         moves_parameters = not frozen and (self.iteration + 1) % settings.hyperparameters_every == 0
         batch, index = self._batch(settings.batch_size, generator)
         passed, latents = self._pass(state.whitened.position, batch, index, generator, move=self.iteration % 2 == 0)
-        self.value = -likelihood(self.factorised, passed, batch.y).mean(-1)
+        self.value = -likelihood(self.prepared, passed, batch.y).mean(-1)
         # Of the hyperparameters here, unless a position of the window serves for them.
         here = moves_parameters and settings.window_size == 1
         current = self._gradients(state.whitened.position, passed, latents, batch, of_parameters=here)
@@ -176,10 +168,9 @@ class Chains:
 
     def draw_last_layer(self, generator: torch.Generator) -> None:
         """Draw the last layer's inducing outputs exactly, given all else, and a momentum from its own law."""
-        whitened, inner, num_data = self.state.whitened, self.factorised.model.num_inner(), self.data.num_rows
+        whitened, inner, num_data = self.state.whitened, self.model.num_inner(), self.data.num_rows
         size = self._step_sizes(whitened, self.settings.step_size, min(self.settings.batch_size, num_data))
-        noise = torch.randn(size.shape, generator=generator, dtype=size.dtype, device=size.device)
-        momentum = noise * size * (whitened.inverse_mass() / num_data).sqrt()
+        momentum = quick_normals(size.shape, size, generator) * size * (whitened.inverse_mass() / num_data).sqrt()
         momentum[:, :inner] = whitened.momentum[:, :inner]
         position = self.last_layer_draws(1, generator)[0]
         self.state = self.state._replace(whitened=whitened._replace(position=position, momentum=momentum))
@@ -190,15 +181,15 @@ class Chains:
     def last_layer_draws(self, num_samples: int, generator: torch.Generator) -> Float[Tensor, "n C V"]:
         """Positions that share the chains' inner layers, each with its own exact draw of the last layer."""
         batch, index = self._batch(self.settings.gibbs_rows, generator)
-        position, inner = self.state.whitened.position, self.factorised.model.num_inner()
+        position, inner = self.state.whitened.position, self.model.num_inner()
         passed, _ = self._pass(position, batch, index, generator, move=False)
         weight = self.data.num_rows / batch.num_rows
-        evidence = last_layer_evidence(self.factorised, self._terms[-1], passed[-1], batch.y, weight)
-        return evidence.posterior().positions(position[:, :inner], num_samples, generator)
+        evidence = last_layer_evidence(self.prepared, passed[-1], batch.y, weight)
+        return evidence.posterior(self.prepared.factorise).positions(position[:, :inner], num_samples, generator)
 
     def _batch(self, size: int, generator: torch.Generator) -> tuple[Data, Int[Tensor, "n"] | None]:
         """Rows of the data, drawn uniformly with replacement, and which they are; None stands for all of them."""
-        num_rows, device = self.data.num_rows, self._flat.device
+        num_rows, device = self.data.num_rows, self._window.device
         if num_rows > size:
             index = torch.randint(num_rows, (size,), generator=generator, device=device)
             return self.data.rows(index), index
@@ -216,23 +207,23 @@ class Chains:
         move: bool,
     ) -> tuple[list[Passed], list[Tensor]]:
         """The rows through all layers with their latents, which are moved before if ``move`` says so."""
-        whitened = self.factorised.model.split(position)
-        latents = [latent if index is None else latent[:, index] for latent in self.state.latents]
+        whitened = self.model.split(position)
+        latents = [latent if index is None else latent.index_select(1, index) for latent in self.state.latents]
         x = batch.x.expand(len(position), -1, -1)
         if index is not None:
-            seen = see(self._terms[0], x)
+            seen = see(self.prepared.layers[0], x)
         else:  # always the same rows, until the hyperparameters move
-            seen = self._seen = self._seen or see(self._terms[0], x)
-        first = pass_first(self._terms, whitened[0], seen)
+            seen = self._seen = self._seen or see(self.prepared.layers[0], x)
+        first = pass_first(self.prepared, whitened[0], seen)
         if not move:
-            return forward(self._terms, whitened, x, latents, first), latents
-        passed, latents = move_latents(self.factorised, self._terms, whitened, batch, latents, generator, first)
+            return forward(self.prepared, whitened, x, latents, first), latents
+        passed, latents = move_latents(self.prepared, whitened, batch, latents, generator, first)
         for held, moved in zip(self.state.latents, latents, strict=True):
             # In place: only `snapshot` keeps a state beyond a step, and it copies them.
             if index is None:
                 held.copy_(moved)
             else:
-                held[:, index] = moved
+                held.index_copy_(1, index, moved)
         return passed, latents
 
     def _gradients(
@@ -244,8 +235,8 @@ class Chains:
         *,
         of_parameters: bool,
     ) -> Gradients:
-        whitened = self.factorised.model.split(position)
-        return gradients(self.factorised, self._terms, whitened, passed, latents, batch.y, of_parameters=of_parameters)
+        whitened = self.model.split(position)
+        return gradients(self.prepared, whitened, passed, latents, batch.y, of_parameters=of_parameters)
 
     def _at_window(self, batch: Data, index: Int[Tensor, "n"] | None, generator: torch.Generator) -> Gradients:
         """Gradients at a position drawn from the window."""
@@ -259,7 +250,7 @@ class Chains:
         settings, parameters, num_data = self.settings, self.state.parameters, self.data.num_rows
         sampled = settings.hyperparameters == "sampled"
         if sampled:
-            prior = flatten(log_prior_gradient(self.factorised.model))
+            prior = flatten(log_prior_gradient(self.model))
             gradient = gradient + prior / num_data
         gradient = -gradient
         if sampled and self.iteration > self._num_burn_in:
@@ -277,21 +268,17 @@ class Chains:
             if sampled:  # which the preconditioner is for
                 parameters = sghmc.adapt(parameters, gradient)
             done = 1.0 if self._settled else min(self.iteration / max(self._num_burn_in, 1), 1.0)
-            self._optimiser.param_groups[0]["lr"] = self.scale * settings.learning_rate * LAST_LEARNING_RATE**done
-            self._flat.copy_(parameters.position)
-            self._flat.grad = gradient
-            self._optimiser.step()
-            parameters = parameters._replace(position=self._flat.clone())
+            rate = self.scale * settings.learning_rate * LAST_LEARNING_RATE**done
+            self._adam, position = adam.step(self._adam, parameters.position, gradient, rate)
+            parameters = parameters._replace(position=position)
         self.state = self.state._replace(parameters=parameters)
         self._refactorise()
 
     def snapshot(self) -> "Snapshot":
         """A copy of everything that `step` moves."""
         latents = [latent.clone() for latent in self.state.latents]
-        optimiser = copy.deepcopy(self._optimiser.state_dict())
-        return Snapshot(
-            self.state._replace(latents=latents), optimiser, self._window.clone(), self.iteration, self.value
-        )
+        state = self.state._replace(latents=latents)
+        return Snapshot(state, self._adam, self._window.clone(), self.iteration, self.value)
 
     def restore(self, snapshot: "Snapshot", scale: float = 1.0) -> None:
         """Go back to a snapshot, with all further steps multiplied by ``scale``, and the chains brought to rest.
@@ -302,7 +289,7 @@ class Chains:
         self.state = ChainState(
             _at_rest(state.whitened), _at_rest(state.parameters), [latent.clone() for latent in state.latents]
         )
-        self._optimiser.load_state_dict(copy.deepcopy(snapshot.optimiser))
+        self._adam = snapshot.adam
         self._window.copy_(snapshot.window)
         self.iteration, self.value = snapshot.iteration, snapshot.value
         self.scale *= scale
@@ -330,7 +317,7 @@ class Snapshot(NamedTuple):
     """See `Chains.snapshot`."""
 
     state: ChainState
-    optimiser: dict[str, Any]
+    adam: AdamState
     window: Tensor
     iteration: int
     value: Tensor

@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gym_dgpmpc.randomness import quick_normals
+
 _TINY = 1e-16
 
 
@@ -27,7 +29,7 @@ class SGHMCState(NamedTuple):
 
     def inverse_mass(self) -> Float[Tensor, "*c V"]:
         """M^-1 = 1 / sqrt(g^2)."""
-        return 1.0 / ((self.square + _TINY).sqrt() + _TINY)
+        return (self.square + _TINY).sqrt_().add_(_TINY).reciprocal_()
 
 
 def init(position: Float[Tensor, "*c V"]) -> SGHMCState:
@@ -38,9 +40,13 @@ def init(position: Float[Tensor, "*c V"]) -> SGHMCState:
 
 def adapt(state: SGHMCState, gradient: Float[Tensor, "*c V"]) -> SGHMCState:
     """Update the running statistics: part of every burn-in step, left out while samples are kept."""
-    rate = 1.0 / (state.averaging + 1.0)
+    longer = state.averaging + 1.0
+    # 1 + xi (1 - g^2 / mean of squares), and the rate 1 / (xi + 1).
+    settled = state.gradient.square().div_(state.square + _TINY)
+    averaging = torch.addcmul(longer, state.averaging, settled, value=-1.0)
+    rate = longer.reciprocal_()
     return state._replace(
-        averaging=1.0 + state.averaging * (1.0 - state.gradient.square() / (state.square + _TINY)),
+        averaging=averaging,
         gradient=torch.lerp(state.gradient, gradient, rate),
         square=torch.lerp(state.square, gradient.square(), rate),
     )
@@ -69,10 +75,8 @@ def step(
     """
     if burn_in:
         state = adapt(state, gradient)
-    inverse_mass = state.inverse_mass()
-    variance = (2.0 * step_size**2 / num_data * decay * inverse_mass).clamp_min(_TINY)
-    noise = (
-        torch.randn(gradient.shape, generator=generator, dtype=gradient.dtype, device=gradient.device) * variance.sqrt()
-    )
-    momentum = (1.0 - decay) * state.momentum - step_size**2 * inverse_mass * gradient + noise
+    stride = state.inverse_mass().mul_(step_size**2)  # eps^2 M^-1
+    deviation = (stride * (2.0 * decay / num_data)).clamp_min_(_TINY).sqrt_()
+    noise = quick_normals(gradient.shape, gradient, generator).mul_(deviation)
+    momentum = noise.add_(state.momentum, alpha=1.0 - decay).addcmul_(stride, gradient, value=-1.0)
     return state._replace(position=state.position + momentum, momentum=momentum)

@@ -73,6 +73,7 @@ def train(
     settings: InferenceSettings,
     *,
     settled: bool = False,
+    compile: bool = True,
     on_look: Callable[[int, float], None] | None = None,
 ) -> Trained:
     """Train for ``num_iterations`` iterations at most.
@@ -82,6 +83,7 @@ def train(
         whitened: inducing outputs to start from, and their preconditioner.
         data: standardised; with early stopping a tenth of it serves to see when to stop.
         settled: hyperparameters and preconditioners come from a training before, which makes for a shorter burn-in.
+        compile: see `gradients.prepare`.
         on_look: is told the iterations done and the negative log likelihood, at the start and at every look.
 
     Raises:
@@ -92,7 +94,7 @@ def train(
         data, held_out, order = _split_off_held_out(data, generator)
     state = sampler.initial_state(model, whitened, data.num_rows, generator)
     burn_in = LATER_BURN_IN if settled else BURN_IN
-    run = Chains(model, state, data, settings, round(burn_in * num_iterations), settled=settled)
+    run = Chains(model, state, data, settings, round(burn_in * num_iterations), settled=settled, compile=compile)
     good, best, rollbacks = run.snapshot(), run.evaluate(_copy_of(generator)), 0
     best_likelihood, looks_since = -math.inf, 0
     if on_look is not None:
@@ -115,7 +117,9 @@ def train(
         if on_look is not None:
             on_look(run.iteration, value)
         if held_out is not None:
-            likelihood = predictive_log_likelihood(run.factorised, run.state.whitened.position, held_out, generator)
+            likelihood = predictive_log_likelihood(
+                run.prepared.factorised, run.state.whitened.position, held_out, generator
+            )
             improved = likelihood > best_likelihood
             best_likelihood = max(best_likelihood, likelihood)
             looks_since = 0 if improved else looks_since + 1
@@ -137,6 +141,8 @@ def sample_pool(
     settings: InferenceSettings,
     scale: float = 1.0,
     on_sample: Callable[[int], None] | None = None,
+    *,
+    compile: bool = True,
 ) -> Sampled:
     """Posterior samples of each chain, ``spacing`` steps apart.
 
@@ -145,13 +151,14 @@ def sample_pool(
 
     Args:
         scale: what training had to multiply steps by.
+        compile: see `gradients.prepare`.
 
     Raises:
         TrainingError: it did so again and again, with ever smaller steps.
     """
     for _ in range(MAX_ROLLBACKS + 1):
         start = state._replace(latents=[latent.clone() for latent in state.latents])
-        chains, positions = Chains(model, start, data, settings, 0, scale=scale), []
+        chains, positions = Chains(model, start, data, settings, 0, scale=scale, compile=compile), []
         with suppress(FactorisationError):  # in an exact draw: the steps before it left values that are not finite
             for position in sampler.sample(chains, num_samples, spacing, generator):
                 positions.append(position)

@@ -5,7 +5,6 @@ truncation and the variance cap are in their published code rather than in the t
 """
 
 import math
-import time
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple
@@ -14,8 +13,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gym_dgpmpc.checks import check_counts
-from gym_dgpmpc.errors import PlanningError
+from gym_dgpmpc.checks import check_counts, check_reals
+from gym_dgpmpc.planning.search import (
+    check_bounds,
+    check_plan,
+    iterations,
+    midpoints,
+    no_finite_score,
+    scored,
+    shifted,
+)
 from gym_dgpmpc.types import Objective, PlanInfo
 
 TRUNCATION = 2.0  # candidates lie within this many standard deviations of the mean
@@ -51,6 +58,37 @@ def elite_shares(scores: Float[Tensor, " K"], num_elites: int) -> Float[Tensor, 
     num_valid, num_above, num_tied = valid.sum(), above.sum(), tied.sum()
     share = above + tied * ((num_valid - num_above) / num_tied.clamp(min=1)).to(scores.dtype)
     return share / num_valid.clamp(min=1)
+
+
+def checked_elites(num_elites: int | None, num_candidates: int) -> int:
+    """The number of elites: as given, or a tenth of the candidates.
+
+    Raises:
+        TypeError, ValueError: it is not positive, or there are fewer candidates.
+    """
+    if num_elites is None:
+        return max(1, num_candidates // 10)
+    check_counts(num_elites=num_elites)
+    if num_elites > num_candidates:
+        raise ValueError(f"num_elites must not exceed num_candidates, got {num_elites} of {num_candidates}")
+    return num_elites
+
+
+def refitted(
+    mean: Float[Tensor, "H A"],
+    variance: Float[Tensor, "H A"],
+    candidates: Float[Tensor, "K H A"],
+    share: Float[Tensor, " K"],
+    smoothing: float,
+) -> tuple[Float[Tensor, "H A"], Float[Tensor, "H A"]]:
+    """The Gaussian of the elites, of which each candidate counts its share, joined with the one before.
+
+    m <- a m + (1 - a) mean(elites), v <- a v + (1 - a) var(elites), with the population variance.
+    """
+    weight = share.to(mean.dtype)
+    elite_mean = torch.tensordot(weight, candidates, 1)
+    elite_variance = torch.tensordot(weight, (candidates - elite_mean).square_(), 1)
+    return elite_mean.lerp(mean, smoothing), elite_variance.lerp(variance, smoothing)
 
 
 class GaussianPlan(NamedTuple):
@@ -104,29 +142,22 @@ class CEM:
         smoothing: float = 0.1,
         min_std: float = 0.005,
     ):
-        _check_bounds(action_low, action_high)
+        check_bounds(action_low, action_high)
         check_counts(horizon=horizon, num_candidates=num_candidates, num_iterations=num_iterations)
-        if num_elites is None:
-            num_elites = max(1, num_candidates // 10)
-        check_counts(num_elites=num_elites)
-        if num_elites > num_candidates:
-            raise ValueError(f"num_elites must not exceed num_candidates, got {num_elites} of {num_candidates}")
-        if not 0.0 <= smoothing < 1.0:
-            raise ValueError(f"smoothing must lie in [0, 1), got {smoothing}")
-        if not min_std >= 0.0:
-            raise ValueError(f"min_std must not be negative, got {min_std}")
+        check_reals("[0, 1)", smoothing=smoothing)
+        check_reals("[0, inf]", min_std=min_std)
         self.action_low = action_low.detach().clone()
         self.action_high = action_high.detach().clone()
         self.horizon = horizon
         self.num_candidates = num_candidates
-        self.num_elites = num_elites
+        self.num_elites = checked_elites(num_elites, num_candidates)
         self.num_iterations = num_iterations
         self.smoothing = smoothing
         self.min_std = min_std
 
     def initial_plan(self) -> GaussianPlan:
         """The middle of the action range at every step, with the start's standard deviation."""
-        return self._widened(self._midpoint(self.horizon))
+        return self._widened(midpoints(self.action_low, self.action_high, self.horizon))
 
     def shift(self, plan: GaussianPlan, num_actions: int) -> GaussianPlan:
         """Drop the first ``num_actions`` of the mean, fill its end with the midpoint and widen it again.
@@ -134,10 +165,8 @@ class CEM:
         Raises:
             ValueError: the plan is not of this planner's shape, or has fewer than ``num_actions`` actions.
         """
-        self._check_plan(plan)
-        if not 0 <= num_actions <= self.horizon:
-            raise ValueError(f"num_actions must lie in 0 to the horizon {self.horizon}, got {num_actions}")
-        return self._widened(torch.cat([plan.mean[num_actions:], self._midpoint(num_actions)]))
+        check_plan(plan, self.initial_plan())
+        return self._widened(shifted(plan.mean, num_actions, midpoints(self.action_low, self.action_high, 1)))
 
     @torch.no_grad()
     def plan(
@@ -149,97 +178,45 @@ class CEM:
         elites, the finite ones alone are fitted. Candidates that tie for the last places share them.
 
         Args:
-            deadline: a time of `time.perf_counter`. No iteration begins that would not end by then, were it as slow as
-                the slowest so far; with no time for a single one the result is ``plan`` within the bounds.
+            deadline: a time of `time.perf_counter`; see `iterations`. With no time for a single iteration the result
+                is ``plan`` within the bounds.
 
         Raises:
             PlanningError: no candidate of an iteration had a finite score.
             ValueError: ``plan`` or the objective's result has the wrong shape.
         """
-        self._check_plan(plan)
+        check_plan(plan, self.initial_plan())
         low, high = self.action_low, self.action_high
         mean, variance = plan.mean.clamp(low, high), plan.std.square()
         shape = (self.num_candidates, self.horizon, low.shape[0])
         narrowest = torch.where(low == high, math.inf, self.min_std * (high - low))
         num_nonfinite, iterations_done, expected_return = 0, 0, math.nan
-        now, slowest = time.perf_counter(), 0.0
-        for iteration in range(1, self.num_iterations + 1):
-            if deadline is not None and now + slowest >= deadline:
-                break
+        for iteration in iterations(self.num_iterations, deadline):
             # Sample candidates from the truncated normal; the cap on its std keeps +-2 std within the bounds, so the
             # clamp only removes rounding. The cap is for sampling alone and does not enter the recursion below.
             room = torch.minimum(mean - low, high - mean)
             std = torch.minimum(variance.sqrt(), room / TRUNCATION)
             noise = truncated_normal(shape, generator, device=low.device, dtype=low.dtype)
-            candidates = torch.addcmul(mean, std, noise).clamp_(low, high)
+            candidates = (mean + std * noise).clamp_(low, high)
 
-            # Score them and select the elites.
-            scores = objective(candidates)
-            if scores.shape != (self.num_candidates,):
-                raise ValueError(f"the objective must return shape ({shape[0]},), got {tuple(scores.shape)}")
-            finite = scores.isfinite()
+            # Score them, select the elites and refit.
+            scores = scored(objective, candidates)
             share = elite_shares(scores, self.num_elites)
-            weight = share.to(low.dtype)
-
-            # Refit: m <- a m + (1 - a) mean(elites), v <- a v + (1 - a) var(elites), population variance.
-            elite_mean = torch.tensordot(weight, candidates, 1)
-            elite_variance = torch.tensordot(weight, (candidates - elite_mean).square_(), 1)
-            mean = elite_mean.lerp(mean, self.smoothing)
-            variance = elite_variance.lerp(variance, self.smoothing)
+            mean, variance = refitted(mean, variance, candidates, share, self.smoothing)
 
             # All that the host must know, in its one synchronisation of the iteration.
+            finite = scores.isfinite()
             narrow = (variance.sqrt() < narrowest).all()
             value = share @ scores.where(finite, 0.0)
             num_finite, is_narrow, expected_return = torch.stack([finite.sum(), narrow, value]).tolist()
             num_nonfinite += self.num_candidates - int(num_finite)
             if num_finite == 0:
-                raise PlanningError(
-                    f"none of the {self.num_candidates} candidate action sequences had a finite score in iteration "
-                    f"{iteration} ({num_nonfinite} non-finite scores in this plan); the model or the reward diverges"
-                )
-            iterations_done, before, now = iteration, now, time.perf_counter()
-            slowest = max(slowest, now - before)
+                raise no_finite_score(self.num_candidates, iteration, num_nonfinite)
+            iterations_done = iteration
             if is_narrow:
                 break
         plan = GaussianPlan(mean.clamp(low, high), variance.sqrt())
         return plan, PlanInfo(expected_return, num_nonfinite, {"num_iterations": iterations_done})
 
-    def _midpoint(self, length: int) -> Float[Tensor, "length A"]:
-        return (self.action_low / 2 + self.action_high / 2).expand(length, -1).clone()
-
     def _widened(self, mean: Float[Tensor, "H A"]) -> GaussianPlan:
         return GaussianPlan(mean, ((self.action_high - self.action_low) / 4).expand_as(mean).clone())
-
-    def _check_plan(self, plan: GaussianPlan) -> None:
-        expected = (self.horizon, self.action_low.shape[0])
-        for name, value in plan._asdict().items():
-            if value.shape != expected or value.dtype != self.action_low.dtype:
-                raise ValueError(
-                    f"plan.{name} must have shape {expected} and {self.action_low.dtype}, "
-                    f"got {tuple(value.shape)} and {value.dtype}"
-                )
-            if not value.isfinite().all():
-                raise ValueError(f"plan.{name} must be finite, got {value}")
-
-
-def _check_bounds(low: Tensor, high: Tensor) -> None:
-    """Raise TypeError or ValueError unless the bounds are two finite floating-point vectors in order."""
-    if not (isinstance(low, Tensor) and isinstance(high, Tensor)):
-        raise TypeError(
-            f"action_low and action_high must be tensors (torch.as_tensor), got {type(low).__name__} and "
-            f"{type(high).__name__}"
-        )
-    if low.ndim != 1 or low.shape != high.shape or low.shape[0] == 0:
-        raise ValueError(
-            f"action_low and action_high must be vectors of one length, got {tuple(low.shape)} and {tuple(high.shape)}"
-        )
-    if not low.is_floating_point() or low.dtype != high.dtype:
-        raise ValueError(
-            f"action_low and action_high must share one floating-point dtype, got {low.dtype}, {high.dtype}"
-        )
-    # The square, because some spaces are "bounded" by the largest number there is, whose variance overflows.
-    if not bool(((high - low).square().isfinite() & (low <= high)).all()):
-        raise ValueError(
-            "the action bounds must be finite, and action_low nowhere above action_high, "
-            f"got {low.tolist()} and {high.tolist()}"
-        )

@@ -8,19 +8,22 @@ import math
 import numbers
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from jaxtyping import Float
 
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import PlanningError
 from gym_dgpmpc.forks import compute_on_one_thread_in_children
 from gym_dgpmpc.planning.plan_state import PlanState
 from gym_dgpmpc.planning.registry import action_bounds
-from gym_dgpmpc.planning.rollout import rollout_objective
+from gym_dgpmpc.planning.risk import RiskMeasure
+from gym_dgpmpc.planning.rollout import EXPECTED, rollout_objective
 from gym_dgpmpc.tasks.task import Task
 from gym_dgpmpc.types import DynamicsModel, Plan, PlanInfo, Planner, TransitionSampler
 
@@ -43,6 +46,15 @@ class Acted(NamedTuple):
     late: bool
 
 
+def _of_risk(name: str) -> property:
+    """An attribute of a controller's measure of risk, checked when it is set."""
+    return property(
+        lambda control: getattr(control.measure, name),
+        lambda control, value: setattr(control, "measure", replace(control.measure, **{name: value})),
+        doc=f"See `RiskMeasure.{name}`; may be set.",
+    )
+
+
 class Controller:
     """Acts by planning through a dynamics model.
 
@@ -55,12 +67,17 @@ class Controller:
         num_particles: P, worlds per plan.
         actions_per_plan: actions of a plan to perform before the next plan is made.
         time_budget: seconds that a plan may take, or None; see `act`.
+        measure: what the returns in the worlds are worth together.
         device: where dynamics and planner compute.
 
     Raises:
         TypeError, ValueError: a number is out of its range, the planner's plans are not NamedTuples of tensors, or
             their actions do not fit ``action_space``.
     """
+
+    risk = _of_risk("risk")
+    risk_aversion = _of_risk("risk_aversion")
+    cvar_share = _of_risk("cvar_share")
 
     def __init__(
         self,
@@ -70,6 +87,7 @@ class Controller:
         num_particles: int = 5,
         actions_per_plan: int = 1,
         time_budget: float | None = None,
+        measure: RiskMeasure = EXPECTED,
         *,
         device: torch.device | str = "cpu",
     ):
@@ -86,6 +104,7 @@ class Controller:
         self.num_particles = num_particles
         self.actions_per_plan = actions_per_plan
         self.time_budget = time_budget
+        self.measure = measure
         compute_on_one_thread_in_children()
 
     @property
@@ -164,7 +183,9 @@ class Controller:
             start = task.start(observation).to(self.device)
             reward_fn, terminated_fn = task.planned[:2]
             assert reward_fn is not None
-            objective = rollout_objective(drawn, reward_fn, start, self.num_particles, terminated_fn)
+            objective = rollout_objective(
+                drawn, reward_fn, start, self.num_particles, terminated_fn, measure=self.measure
+            )
             try:
                 plan, info = self.planner.plan(objective, plan, generator, deadline=deadline)
                 late = deadline is not None and time.perf_counter() > deadline
@@ -184,8 +205,11 @@ class Controller:
 
     def uniform(self, generator: torch.Generator) -> np.ndarray:
         """A uniformly random action, [A]."""
-        uniform = torch.rand(self._low.shape, generator=generator, dtype=torch.float32, device=self.device)
-        return (self._low + (self._high - self._low) * uniform).cpu().numpy()
+        return self.within(torch.rand(self._low.shape, generator=generator, dtype=torch.float32, device=self.device))
+
+    def within(self, share: Float[torch.Tensor, " A"]) -> np.ndarray:
+        """The action that lies at these shares of the range, from 0, the lower bounds, to 1, [A]."""
+        return (self._low + (self._high - self._low) * share).clamp(self._low, self._high).cpu().numpy()
 
     def _check_planned(self, plan: Plan) -> None:
         """Raise PlanningError unless a plan can be performed, carried on and saved.

@@ -4,16 +4,21 @@ A new planner is one line, ``register_planner("my-planner", MyPlanner)``; an age
 """
 
 import re
-from typing import Any, TypeGuard
+from typing import Any, Literal, TypeGuard
 
 import torch
 from gymnasium import spaces
 
 from gym_dgpmpc.planning.cem import CEM
+from gym_dgpmpc.planning.icem import ICEM
+from gym_dgpmpc.planning.mppi import MPPI
 from gym_dgpmpc.types import Planner, PlannerFactory
 
-PLANNERS: dict[str, PlannerFactory] = {"cem": CEM}
+PLANNERS: dict[str, PlannerFactory] = {"cem": CEM, "icem": ICEM, "mppi": MPPI}
 """The registered planners; add to them with `register_planner`."""
+
+PlannerName = Literal["cem", "icem", "mppi"]
+"""Those that come with the package, for editors and type checkers; any registered name will do."""
 
 
 def register_planner(name: str, factory: PlannerFactory) -> None:

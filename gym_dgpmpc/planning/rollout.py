@@ -1,10 +1,11 @@
-"""From a drawn world and a reward to the planner's objective: action sequences in, expected returns out.
+"""From a drawn world and a reward to the planner's objective: action sequences in, scores out.
 
-The objective is the Monte Carlo estimate over P particles of the return of H actions from the present observation,
+The return of H actions from the present observation in the world of particle p is
 
-    score(a) = 1/P sum_p sum_{t<H} alive[t, p] r(s[t, p], a[t], s[t+1, p]),
+    R[p](a) = sum_{t<H} alive[t, p] r(s[t, p], a[t], s[t+1, p]),
 
-where a particle is alive until, and including, the step in which it terminates.
+where a particle is alive until, and including, the step in which it terminates. The score is a measure of the returns:
+their mean, the Monte Carlo estimate of the expected return, or another one of `risk.py`.
 """
 
 from typing import Literal
@@ -14,7 +15,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gym_dgpmpc.checks import check_counts
+from gym_dgpmpc.planning.risk import RiskMeasure
 from gym_dgpmpc.types import Objective, RewardFn, TerminatedFn, TrajectorySampler, TransitionSampler
+
+EXPECTED = RiskMeasure()
 
 
 @torch.no_grad()
@@ -96,10 +100,11 @@ def rollout_objective(
     observation: Float[Tensor, " S"],
     num_particles: int,
     terminated_fn: TerminatedFn | None = None,
+    measure: RiskMeasure = EXPECTED,
 ) -> Objective:
-    """The planner's objective: the mean over the particles of the return from ``observation``.
+    """The planner's objective: what ``measure`` makes of the particles' returns from ``observation``.
 
-    One particle that is not finite makes its candidate's score not finite; the mean leaves no particle out.
+    One particle that is not finite makes its candidate's score not finite; no measure leaves such a one out.
 
     Raises:
         ValueError: ``num_particles`` is not positive or ``observation`` not a floating-point vector.
@@ -112,7 +117,7 @@ def rollout_objective(
 
     def score(actions: Float[Tensor, "K H A"]) -> Float[Tensor, " K"]:
         states = rollout(sampler, observation, actions, num_particles)
-        return particle_returns(states, actions, reward_fn, terminated_fn).mean(dim=0)
+        return measure(particle_returns(states, actions, reward_fn, terminated_fn))
 
     return score
 

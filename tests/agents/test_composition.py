@@ -1,6 +1,7 @@
 """How agents are made: settings with one source, planners by name or object, Stable-Baselines3's order of arguments."""
 
 import inspect
+from typing import get_args
 
 import gymnasium as gym
 import numpy as np
@@ -14,13 +15,26 @@ from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent
 from gym_dgpmpc.checkpoints.format import read_checkpoint
 from gym_dgpmpc.errors import CheckpointError
 from gym_dgpmpc.planning import CEM, PLANNERS, register_planner
+from gym_dgpmpc.planning.registry import PlannerName
+from gym_dgpmpc.planning.risk import RiskMeasure
 from gym_dgpmpc.settings import argument_texts, settings_of
 from tests.agents.point_mass import LENGTH, KnownPointMass, LinearModel, agent, planner
 from tests.agents.test_dgp_mpc import TINY
+from tests.checkpoints.common import changed, load
 from tests.planning.toy_planners import RandomShooting
 
 NAMED = (DGPMPCAgent, GPMPCAgent, PETSAgent)
-NOT_SAVED = {"policy", "env", "reward_fn", "terminated_fn", "device", "compile", "dynamics", "settings"}
+NOT_SAVED = {
+    "policy",
+    "env",
+    "reward_fn",
+    "terminated_fn",
+    "first_controller",
+    "device",
+    "compile",
+    "dynamics",
+    "settings",
+}
 
 
 @pytest.fixture
@@ -228,3 +242,28 @@ def test_planning_has_one_owner(tmp_path):
     for name, value in (("time_budget", -1.0), ("num_particles", 0), ("actions_per_plan", 6)):
         with pytest.raises(ValueError, match=f"{name}.*{value}"):
             setattr(learner, name, value)
+
+
+def test_risk_is_a_setting_of_every_agent(tmp_path, unchecked):
+    learner = agent(risk="cvar", cvar_share=0.4).learn(LENGTH + 2)
+    assert learner.controller.measure == RiskMeasure("cvar", 1.0, 0.4)
+    learner.risk, learner.risk_aversion = "mean-std", 2.0
+    learner.save(tmp_path / "agent")
+    loaded = load(tmp_path / "agent")
+    assert (loaded.risk, loaded.risk_aversion, loaded.cvar_share) == ("mean-std", 2.0, 0.4)
+    np.testing.assert_array_equal(*(each.predict(np.ones(2), deterministic=True)[0] for each in (learner, loaded)))
+    with pytest.raises(ValueError, match="median"):
+        learner.risk = "median"
+    with pytest.raises(ValueError, match=r"cvar_share .*2"):
+        agent(cvar_share=2.0)
+    changed(tmp_path / "agent.zip", tmp_path / "bad.zip", lambda c, t: c["arguments"].update(risk="os.system"))
+    with pytest.raises(CheckpointError, match=r"os\.system"):
+        load(tmp_path / "bad.zip")
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+@pytest.mark.parametrize("agent_class", [*NAMED, MPCAgent])
+def test_every_planner_fits_every_agent(agent_class, name):
+    """None of its settings has the name of one of the agent or of its model."""
+    assert "num_candidates" in agent_class.saved_settings(name)
+    assert set(get_args(PlannerName)) == set(PLANNERS)

@@ -26,10 +26,13 @@ def test_stock_settings_make_an_agent(env_id):
 
 
 def test_settings_are_found_by_id():
-    assert presets.settings_for("ModCartPole-v0") is presets.PAPER["ModCartPole-v0"]
-    assert presets.settings_for("Pendulum-v1") is presets.STOCK["Pendulum-v1"]
+    assert presets.settings_for("ModCartPole-v0") == presets.PAPER["ModCartPole-v0"]
+    assert presets.settings_for("Pendulum-v1") == presets.STOCK["Pendulum-v1"]
+    half_cheetah = presets.settings_for("VelocityHalfCheetah-v0")
+    own = {"linear": True, "first_training_iterations": 300}
+    assert half_cheetah == {**presets.PAPER["VelocityHalfCheetah-v0"], **own}
     with_module = "gym_dgpmpc.envs.robotics:FetchReachDense-v4"
-    assert presets.settings_for(with_module) is presets.STOCK["FetchReachDense-v4"]
+    assert presets.settings_for(with_module) == presets.STOCK["FetchReachDense-v4"]
     assert presets.settings_for("ToyPush-v0") == {}
     assert not set(presets.PAPER) & set(presets.STOCK)
 

@@ -63,6 +63,21 @@ def test_pets_trains_as_published(name, draw, task):
 
 
 @pytest.mark.parametrize("task", PAPER)
+def test_rivals_are_there_as_published_and_at_their_best(task):
+    """What they differ in is what their names say."""
+
+    def differences(one, other):
+        one, other = (METHODS[name].settings(TASKS[task]) for name in (one, other))
+        assert set(one) == set(other)
+        return {name: (one[name], other[name]) for name in one if one[name] != other[name]}
+
+    longer = differences("PETS TSinf", "PETS TSinf to its optimum")
+    assert longer == {"num_epochs": (5, 300), "patience": (None, 15)}
+    for draw in ("MM", "DS"):
+        assert differences(f"GP-{draw}", f"GP-{draw} with noise") == {"add_noise": (False, True)}
+
+
+@pytest.mark.parametrize("task", PAPER)
 @pytest.mark.parametrize("draw", ["MM", "DS"])
 def test_gps_have_the_papers_inducing_points(draw, task):
     found = METHODS[f"GP-{draw}"].settings(TASKS[task])

@@ -13,6 +13,7 @@ from benchmarks.methods import METHODS
 from benchmarks.result_files import ResultError, RunResult
 from benchmarks.run import OtherRunError, Run
 from benchmarks.tasks import TASKS
+from gym_dgpmpc.errors import DGPMPCError
 from gym_dgpmpc.planning import CEM
 from tests.benchmarks.toy import CART_POLE, TINY, TOY, steps_in, toy
 from tests.runs.toy import EPISODE_STEPS
@@ -120,6 +121,18 @@ def test_a_run_of_more_episodes_goes_on_from_the_shorter_one(folders, tmp_path):
     longer.perform(folders)
     assert steps_in(diary) == 3 * EPISODE_STEPS
     assert run.is_finished(folders.results)
+
+
+def test_an_unfinished_run_that_is_older_than_a_setting_goes_on(folders):
+    run = tiny(DGP, episodes=1)
+    run.perform(folders)
+    (file,) = folders.work.rglob("settings.json")
+    content = json.loads(file.read_text())
+    del content["settings"]["risk"]
+    file.write_text(json.dumps(content))
+    assert "2 episodes" in replace(run, episodes=2).perform(folders)
+    with pytest.raises(DGPMPCError, match="risk was mean, now worst"):
+        tiny(DGP, episodes=2, asked={"risk": "worst"}).perform(folders)
 
 
 def test_a_finished_run_is_not_done_again(folders, tmp_path):

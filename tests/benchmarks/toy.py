@@ -18,12 +18,17 @@ TINY = {
     "DGP-MPC L=1 matern32": {name: value for name, value in SMALLEST_AGENT.items() if name != "num_layers"},
     "PETS TS1": NETWORKS | PLANNING,
     "PETS TSinf": NETWORKS | PLANNING,
+    "PETS TSinf to its optimum": NETWORKS | PLANNING | {"num_epochs": 2, "patience": 1},
     "PETS as published": NETWORKS | PLANNING,
     "GP-MM": PLANNING | {"num_inducing": 6, "max_training_iterations": 3},
     "GP-DS": PLANNING | {"num_inducing": 6, "max_training_iterations": 3},
+    "GP-MM with noise": PLANNING | {"num_inducing": 6, "max_training_iterations": 3},
+    "GP-DS with noise": PLANNING | {"num_inducing": 6, "max_training_iterations": 3},
     "true dynamics": PLANNING,
     "SAC": OFF_POLICY,
     "TD3": OFF_POLICY,
+    "CrossQ": OFF_POLICY,
+    "TQC": OFF_POLICY,
     "PPO": {"n_epochs": 1},
 }
 """Settings of every method that make a run of it take less than a second."""

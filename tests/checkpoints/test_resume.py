@@ -27,6 +27,7 @@ from gym_dgpmpc.errors import (
     ReliabilityWarning,
     RunInUseError,
 )
+from gym_dgpmpc.planning import PLANNERS
 from gym_dgpmpc.tasks.replay import generator_states, set_generator_states
 from tests.agents.point_mass import LENGTH, TIME_STEP, KnownPointMass, agent
 from tests.faults.compare import checkpoint_differences, log_differences
@@ -105,6 +106,17 @@ def test_a_killed_run_ends_as_the_whole_one(whole, tmp_path, kills, every):
     learner = train(tmp_path, every=every, actions_per_plan=2)
     assert learner.num_timesteps == len(learner.store) == TOTAL
     assert_same(whole, tmp_path)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_the_plans_of_every_planner_go_on(planner, tmp_path):
+    """What they carry, such as elites, is in the checkpoint within an episode, bit by bit."""
+    settings = {"planner": planner, "horizon": 4, "num_candidates": 30, "num_iterations": 2, "actions_per_plan": 2}
+    settings |= {"total": LENGTH + 8, "logs": False}
+    train(tmp_path / "whole", **settings)
+    train(tmp_path / "parts", kill_at=LENGTH + 5, every=3, **settings)
+    train(tmp_path / "parts", **settings)
+    assert checkpoint_differences(tmp_path / "whole" / "agent.zip", tmp_path / "parts" / "agent.zip") == []
 
 
 def test_a_run_goes_on_with_more_steps(whole, tmp_path):

@@ -8,7 +8,7 @@ from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.deep_gp import Factorised, factorise_all
 from gym_dgpmpc.gp.layer import conditional
 from gym_dgpmpc.inference.following import BLOCK, Follower
-from gym_dgpmpc.inference.gradients import forward, layer_terms
+from gym_dgpmpc.inference.gradients import forward, prepare
 from gym_dgpmpc.inference.last_layer import LastLayerEvidence, last_layer_evidence
 from tests.oracles.models import chains, make_model, normal, seeded
 
@@ -27,7 +27,7 @@ def problem(num_layers, num_chains=2):
 
 
 def follower(factorised, position):
-    return Follower(factorised, position[:, : factorised.model.num_inner()])
+    return Follower(factorised.model, position[:, : factorised.model.num_inner()])
 
 
 def first(data, num_rows):
@@ -50,10 +50,10 @@ def walk(following, position, data, latents, sizes, generator):
 
 def expected(factorised, position, data, latents):
     """The last layer's posterior given all rows, by one sum."""
-    terms, by_layer = layer_terms(factorised), factorised.model.split(position)
+    prepared, by_layer = prepare(factorised.model), factorised.model.split(position)
     x = data.x.expand(len(position), -1, -1)
-    passed = forward(terms, by_layer, x, [latent.double() for latent in latents])
-    return last_layer_evidence(factorised, terms[-1], passed[-1], data.y).posterior()
+    passed = forward(prepared, by_layer, x, [latent.double() for latent in latents])
+    return last_layer_evidence(prepared, passed[-1], data.y).posterior()
 
 
 def equal(one, other):
@@ -67,8 +67,8 @@ def posteriors(monkeypatch):
     """Every posterior that is drawn from."""
     seen, original = [], LastLayerEvidence.posterior
 
-    def watched(self):
-        seen.append(original(self))
+    def watched(self, *args):
+        seen.append(original(self, *args))
         return seen[-1]
 
     monkeypatch.setattr(LastLayerEvidence, "posterior", watched)

@@ -10,7 +10,7 @@ from gym_dgpmpc.gp.exact import whitened_posterior
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.gp.layer import Layer, conditional, project
 from gym_dgpmpc.inference import sghmc
-from gym_dgpmpc.inference.gradients import forward, layer_terms
+from gym_dgpmpc.inference.gradients import forward, prepare
 from gym_dgpmpc.inference.last_layer import last_layer_evidence
 from gym_dgpmpc.inference.sampler import Chains, initial_state, step_sizes
 from gym_dgpmpc.inference.settings import InferenceSettings
@@ -43,10 +43,9 @@ def toy(generator):
 
 def posterior(model, whitened, data, latents=(), weight=1.0):
     """That of every chain, of models side by side."""
-    factorised = factorise_all(model)
-    terms = layer_terms(factorised)
-    passed = forward(terms, model.split(whitened), data.x.expand(len(whitened), -1, -1), latents)
-    return last_layer_evidence(factorised, terms[-1], passed[-1], data.y, weight).posterior()
+    prepared = prepare(model)
+    passed = forward(prepared, model.split(whitened), data.x.expand(len(whitened), -1, -1), latents)
+    return last_layer_evidence(prepared, passed[-1], data.y, weight).posterior()
 
 
 def started(model, data, generator, **settings):

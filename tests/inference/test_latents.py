@@ -9,7 +9,7 @@ import torch
 from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.gp.deep_gp import factorise_all
 from gym_dgpmpc.gp.layer import conditional
-from gym_dgpmpc.inference.gradients import forward, layer_terms
+from gym_dgpmpc.inference.gradients import forward, prepare
 from gym_dgpmpc.inference.latents import move_latents, with_latents
 from tests.oracles.models import chains, make_model, normal, seeded
 
@@ -31,10 +31,10 @@ def test_a_datums_latents_settle_in_their_conditional_law():
     together, num = chains(*models), 3000
     whitened = 1.5 * normal(generator, 2, together.num_whitened())
     x, y = torch.tensor([[0.4]], dtype=torch.float64), torch.tensor([[0.8]], dtype=torch.float64)
-    factorised, data = factorise_all(together), Data(x.repeat(num, 1), y.repeat(num, 1))
-    terms, latents = layer_terms(factorised), [normal(generator, 2, num, 1)]
+    prepared, data = prepare(together), Data(x.repeat(num, 1), y.repeat(num, 1))
+    latents = [normal(generator, 2, num, 1)]
     for _ in range(100):
-        _, latents = move_latents(factorised, terms, together.split(whitened), data, latents, generator)
+        _, latents = move_latents(prepared, together.split(whitened), data, latents, generator)
     nodes, weights = (torch.from_numpy(part) for part in np.polynomial.hermite_e.hermegauss(200))
     for c, model in enumerate(models):
         factors, split = factorise_all(model).factors, model.split(whitened[c])
@@ -55,13 +55,13 @@ def test_a_datums_latents_settle_in_their_conditional_law():
 def test_moved_points_are_those_of_the_moved_latents():
     generator = seeded(4)
     model = chains(*(uncertain(make_model(2, 2, 2, 5, generator, "matern32")) for _ in range(2)))
-    factorised, data = factorise_all(model), Data(normal(generator, 9, 2), normal(generator, 9, 2))
-    terms, whitened = layer_terms(factorised), model.split(normal(generator, 2, model.num_whitened()))
+    prepared, data = prepare(model), Data(normal(generator, 9, 2), normal(generator, 9, 2))
+    whitened = model.split(normal(generator, 2, model.num_whitened()))
     before = [normal(generator, 2, 9, 2)]
-    passed, after = move_latents(factorised, terms, whitened, data, before, generator)
+    passed, after = move_latents(prepared, whitened, data, before, generator)
     accepted = (after[0] != before[0]).any(-1)
     assert accepted.any() and not accepted.all()
-    for one, other in zip(passed, forward(terms, whitened, data.x.expand(2, -1, -1), after), strict=True):
+    for one, other in zip(passed, forward(prepared, whitened, data.x.expand(2, -1, -1), after), strict=True):
         for a, b in zip((*one.seen, one.mean, one.variance), (*other.seen, other.mean, other.variance), strict=True):
             torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-10)
 

@@ -9,10 +9,11 @@ from gym_dgpmpc.inference import priors
 from tests.oracles.models import chains, make_model, seeded
 
 
+@pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("num_layers", [1, 3])
-def test_the_gradient_is_that_of_normal_densities(num_layers):
-    """About lengthscales of sqrt(D), variances of 1 (of an inner layer 0.01), and a noise variance of 0.05."""
-    model = chains(*(make_model(num_layers, 3, 2, 4, seeded(seed)) for seed in (0, 1)))
+def test_the_gradient_is_that_of_normal_densities(num_layers, linear):
+    """About lengthscales of sqrt(D), variances of 1 (inner layers: 0.01), slopes of 0.5, noise variances of 0.05."""
+    model = chains(*(make_model(num_layers, 3, 2, 4, seeded(seed), linear=linear) for seed in (0, 1)))
     leaves = [parameter.clone().requires_grad_() for parameter in model.parameters()]
     live, log_density = model.with_parameters(leaves), torch.zeros((), dtype=torch.float64)
 
@@ -24,6 +25,8 @@ def test_the_gradient_is_that_of_normal_densities(num_layers):
         variance = 1.0 if index == num_layers - 1 else 0.01
         for parameter, centre in ((layer.log_lengthscale, math.sqrt(3.0)), (layer.log_variance, variance)):
             log_density = log_density + normal(parameter, math.log(centre), 3.0)
+        if layer.log_slope is not None:
+            log_density = log_density + normal(layer.log_slope, math.log(0.5), 3.0)
     log_density = log_density + normal(live.log_noise, math.log(0.05), 3.0)
     found = priors.log_prior_gradient(model)
     for one, other in zip(found, torch.autograd.grad(log_density, leaves), strict=True):

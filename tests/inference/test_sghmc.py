@@ -17,7 +17,7 @@ from tests.oracles.models import normal, seeded
 def test_the_recursion_is_that_of_a_second_implementation(num_data, burn_in):
     gradients = 0.3 + normal(seeded(1), 12, 5) * torch.tensor([1e-3, 0.1, 1.0, 10.0, 1e4]).double()
     position, twin = normal(seeded(2), 5), seeded(3)
-    noises = np.stack([normal(twin, 5).numpy() for _ in range(12)])
+    noises = np.stack([torch.randn(5, generator=twin).double().numpy() for _ in range(12)])
     state, generator = sghmc.init(position), seeded(3)
     for gradient in gradients:
         state = sghmc.step(state, gradient, num_data, generator, step_size=0.1, decay=0.05, burn_in=burn_in)

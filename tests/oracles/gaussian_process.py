@@ -19,6 +19,7 @@ class DenseLayer(NamedTuple):
     inducing_inputs: np.ndarray  # [M, D]
     lengthscale: np.ndarray  # [D]
     variance: float
+    slope: np.ndarray | float = 0.0  # [D], standard deviation of a linear function's, over the kernel's
 
 
 def correlation(kernel: str, distance: np.ndarray) -> np.ndarray:
@@ -33,8 +34,9 @@ def correlation(kernel: str, distance: np.ndarray) -> np.ndarray:
 
 def covariance(kernel: str, layer: DenseLayer, x: np.ndarray, z: np.ndarray) -> np.ndarray:
     """k(x, z) [..., n, m]."""
-    difference = (x[..., :, None, :] - z[..., None, :, :]) / layer.lengthscale
-    return layer.variance * correlation(kernel, np.sqrt((difference**2).sum(-1)))
+    x, z = x[..., :, None, :] / layer.lengthscale, z[..., None, :, :] / layer.lengthscale
+    linear = (x * z * np.square(layer.slope)).sum(-1)
+    return layer.variance * (correlation(kernel, np.sqrt(((x - z) ** 2).sum(-1))) + linear)
 
 
 def inducing_covariance(kernel: str, layer: DenseLayer) -> np.ndarray:

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from gym_dgpmpc.errors import PlanningError
 from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.plan_state import pack, unpack
+from gym_dgpmpc.planning.risk import RiskMeasure
 from gym_dgpmpc.tasks.task import Task, TaskArguments
 from gym_dgpmpc.types import PlanInfo
 from tests.planning.test_planner_contract import FACTORIES
@@ -130,6 +131,38 @@ def test_what_is_set_holds_from_the_next_plan_on():
     acted = control.act(TASK, OBSERVATION, carried, seeded())
     assert acted.info is not None and acted.carried.age == 0
     assert control.dynamics.drawn == [(2, 4)]
+
+
+class Gaining(Drifting):
+    """An action earns its negative in one world and four times itself in the other."""
+
+    def draw(self, num_particles, horizon, generator):
+        gains = torch.tensor([-1.0, 4.0])[:, None, None]
+        return lambda observation, action, step: gains * action.expand(2, -1, -1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_measure_of_risk_decides_what_is_planned(seed):
+    """The worst world is best served by standing still, the mean and the best one by all there is."""
+    control, acted = controller("cem", num_particles=2), {}
+    control.dynamics = Gaining()
+    task = a_task(lambda observation, action, next_observation: next_observation[..., 0])
+    for risk in ("mean", "worst", "best"):
+        control.risk = risk
+        acted[risk] = control.act(task, OBSERVATION, control.cold, seeded(seed))
+    assert abs(acted["worst"].action) < 0.5 < min(acted["mean"].action, acted["best"].action)
+    returns = [acted[risk].info.expected_return for risk in ("worst", "mean", "best")]
+    assert returns[0] <= 0.0 < returns[1] < returns[2]
+
+
+@pytest.mark.parametrize(("setting", "value"), [("risk", "median"), ("risk_aversion", math.nan), ("cvar_share", 0.0)])
+def test_the_measure_of_risk_is_checked_when_it_is_set(setting, value, unchecked):
+    control = controller(measure=RiskMeasure("cvar", 2.0, 0.5))
+    with pytest.raises(ValueError, match=rf"{setting} .*{value}"):
+        setattr(control, setting, value)
+    assert control.measure == RiskMeasure("cvar", 2.0, 0.5)
+    control.cvar_share = 0.25
+    assert control.measure == RiskMeasure("cvar", 2.0, 0.25)
 
 
 @pytest.mark.parametrize(

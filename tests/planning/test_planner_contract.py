@@ -14,13 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gym_dgpmpc.errors import PlanningError
-from gym_dgpmpc.planning import CEM
+from gym_dgpmpc.planning import CEM, ICEM, MPPI
 from gym_dgpmpc.planning.plan_state import PlanState, pack, plans_from_tensors, plans_to_tensors, unpack
 from gym_dgpmpc.types import Plan, Planner
 from tests.planning.toy_planners import ElitesKept, RandomShooting
 
 FACTORIES = {
     "cem": partial(CEM, num_candidates=64, num_elites=8, num_iterations=4),
+    "icem": partial(ICEM, num_candidates=64, num_elites=8, num_iterations=4),
+    "mppi": partial(MPPI, num_candidates=64, num_iterations=4),
     "one sequence": partial(RandomShooting, num_candidates=256),
     "elites": partial(ElitesKept, num_candidates=128),
 }

@@ -7,10 +7,7 @@ The compiled code has kernels of its own, which it is asked for by name; one tha
 
 import ctypes
 import math
-import os
-import warnings
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -19,13 +16,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from gym_dgpmpc import compiler
 from gym_dgpmpc.dynamics.coordinates import Coordinates
-from gym_dgpmpc.dynamics.deep_gp import compiler
 from gym_dgpmpc.dynamics.noise import PathNoise
 from gym_dgpmpc.gp.kernels import Kernel
 
 _Floats = ctypes.POINTER(ctypes.c_float)
 _Integers = ctypes.POINTER(ctypes.c_int64)
+
+SOURCE = "dynamics/deep_gp/native/rollout.cpp"
 
 AS_IS, SINE, COSINE, ACTION, FORWARDS, LEFTWARDS = range(6)
 
@@ -40,6 +39,7 @@ class PathwiseLayer(NamedTuple):
     frequencies: Float[Tensor, "P D half_F"]  # from x to the features' angles, in turns
     kernel_out: Float[Tensor, "T P O M"]  # sigma^2 alpha; T = H with refresh="step", else 1
     feature_out: Float[Tensor, "T P O F"]  # sigma sqrt(2 / F) w, of all cosines, then of all sines
+    linear_out: Float[Tensor, "T P O D"] | None  # of a linear part, for x over the lengthscales
 
 
 class _Layer(ctypes.Structure):
@@ -53,6 +53,7 @@ class _Layer(ctypes.Structure):
         ("frequencies", _Floats),
         ("kernel_out", _Floats),
         ("feature_out", _Floats),
+        ("linear_out", _Floats),
     )
 
 
@@ -92,7 +93,7 @@ def is_available(kernel: Kernel | None = None) -> bool:
         return False
     if kernel is None or _kernel_number(kernel) is not None:
         return True
-    _warn_of_unknown_kernel(kernel.name)
+    compiler.warn_once(f"there is no kernel {kernel.name!r} in {SOURCE}")
     return False
 
 
@@ -193,11 +194,9 @@ class CompiledRollout:
             return sum(calls)
 
         # Shares of whole blocks: a block that is half full costs as much as a full one.
-        threads = torch.get_num_threads()
-        share = -(-num_candidates // threads // points) * points
+        share = -(-num_candidates // torch.get_num_threads() // points) * points
         ranges = [(first, min(first + share, num_candidates)) for first in range(0, num_candidates, share)]
-        failed = run(*ranges[0]) if len(ranges) == 1 else sum(_threads(threads).map(lambda r: run(*r), ranges))
-        if failed:
+        if compiler.in_threads(run, ranges):
             raise MemoryError("could not allocate the scratch space of a rollout, a few kilobytes for each thread")
         states = states if origin is None else states + origin
         return states if self._noise is None else self._noise.all_observed(states, observation)
@@ -235,11 +234,12 @@ class CompiledRollout:
 
     def _described(self, layer: PathwiseLayer) -> _Layer:
         """A layer as the compiled code is told of it."""
-        number = _kernel_number(layer.kernel)
-        if number is None:
-            raise RuntimeError(f"the compiled code has no kernel {layer.kernel.name!r}: check is_available first")
         kernel, *weights = layer
-        return _Layer(number, kernel.argument_scale, layer.kernel_out.shape[2], *map(self._floats, weights))
+        number = _kernel_number(kernel)
+        if number is None:
+            raise RuntimeError(f"the compiled code has no kernel {kernel.name!r}: check is_available first")
+        pointers = (None if weight is None else self._floats(weight) for weight in weights)
+        return _Layer(number, kernel.argument_scale, layer.kernel_out.shape[2], *pointers)
 
     def _floats(self, values: Tensor) -> "ctypes._Pointer[ctypes.c_float]":
         self._kept_alive.append(values.to(torch.float32).contiguous())
@@ -252,7 +252,7 @@ class CompiledRollout:
 
 @cache
 def _library() -> ctypes.CDLL | None:
-    library = compiler.load("rollout")
+    library = compiler.load(SOURCE, "-ffp-contract=off")
     if library is not None:
         library.rollout.argtypes = (ctypes.POINTER(_Task), *(ctypes.c_int64,) * 3)
         library.kernel_number.argtypes = (ctypes.c_char_p,)
@@ -266,24 +266,6 @@ def _kernel_number(kernel: Kernel) -> int | None:
     library = _library()
     number = -1 if library is None else int(library.kernel_number(kernel.name.encode()))
     return None if number < 0 else number
-
-
-@cache
-def _warn_of_unknown_kernel(name: str) -> None:
-    warnings.warn(
-        f"planning does without compiled code, several times slower, because that has no kernel {name!r}: add it to "
-        "dynamics/deep_gp/native/rollout.cpp, or pass compile=False to silence this warning",
-        stacklevel=2,
-    )
-
-
-@cache
-def _threads(num_threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(num_threads, thread_name_prefix="rollout")
-
-
-if hasattr(os, "register_at_fork"):  # a forked child inherits the pools, but none of their threads
-    os.register_at_fork(after_in_child=_threads.cache_clear)
 
 
 def _pointer(tensor: Tensor) -> "ctypes._Pointer[ctypes.c_float]":

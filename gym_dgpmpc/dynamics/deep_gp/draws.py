@@ -102,10 +102,11 @@ def _draw_layer(
     """Draw ``num_functions`` functions per particle from p(f | u), by Matheron's rule.
 
     f(x) = phi(x) . w + k(x, Z) alpha with alpha = L_z^-T (v - L_z^-1 (phi(Z) w + sqrt(jitter) e)), w, e ~ N(0, I)
-    (Wilson et al. 2020, eq. 13). The term e makes the law exact for the jittered K_zz. Every particle has features of
-    its own, so that over the particles of one plan the law is right, and not only over plans; its functions share them,
-    so all alpha of many functions are one product of their normals (w, e) with K_zz^-1 (phi(Z), sqrt(jitter) I); for
-    few, two solves with a column for each output cost less.
+    (Wilson et al. 2020, eq. 13). The features of a linear part are x times its slopes' standard deviations, exactly.
+    The term e makes the law exact for the jittered K_zz. Every particle has features of its own, so that over the
+    particles of one plan the law is right, and not only over plans; its functions share them, so all alpha of many
+    functions are one product of their normals (w, e) with K_zz^-1 (phi(Z), sqrt(jitter) I); for few, two solves with a
+    column for each output cost less.
     """
     num_particles, num_inducing, outputs = whitened.shape
     lengthscale = layer.lengthscale.unsqueeze(-2)
@@ -113,24 +114,33 @@ def _draw_layer(
     features = draw_features(layer.kernel, num_particles, num_features, scaled.shape[-1], generator, scaled.dtype)
     columns = num_functions * outputs
     # Normals are drawn in single precision, which is six times faster and ample for random numbers.
-    shape = (num_particles, num_features + num_inducing, columns)
+    values, root = features(scaled), None
+    if layer.log_slope is not None:
+        root = layer.log_slope.exp()
+        values = torch.cat([values, scaled * root.unsqueeze(-2)], dim=2)
+    shape = (num_particles, values.shape[-1] + num_inducing, columns)
     normals = torch.randn(shape, generator=generator, dtype=torch.float32, device=scaled.device)
     variance = layer.variance[:, None, None]
     sigma = variance.sqrt()
-    phi, drawn = features(scaled), normals.to(scaled.dtype)
-    if columns < num_features + num_inducing:
-        prior = sigma * torch.baddbmm(drawn[:, num_features:], phi, drawn[:, :num_features], beta=JITTER**0.5)
-        rest = whitened.repeat(1, 1, num_functions) - torch.linalg.solve_triangular(factor, prior, upper=False)
+    drawn, rest = normals.to(scaled.dtype), whitened.repeat(1, 1, num_functions)
+    if columns < normals.shape[1]:
+        prior = sigma * torch.baddbmm(drawn[:, -num_inducing:], values, drawn[:, :-num_inducing], beta=JITTER**0.5)
+        rest -= torch.linalg.solve_triangular(factor, prior, upper=False)
         alpha = torch.linalg.solve_triangular(factor.mT, rest, upper=True)
     else:
-        eye = torch.eye(num_inducing, dtype=phi.dtype, device=phi.device).expand(num_particles, -1, -1)
-        shared = torch.cholesky_solve(sigma * torch.cat([phi, JITTER**0.5 * eye], dim=2), factor)
+        eye = torch.eye(num_inducing, dtype=values.dtype, device=values.device).expand(num_particles, -1, -1)
+        shared = torch.cholesky_solve(sigma * torch.cat([values, JITTER**0.5 * eye], dim=2), factor)
         known = torch.linalg.solve_triangular(factor.mT, whitened, upper=True)
         alpha = known.repeat(1, 1, num_functions) - shared @ drawn
 
     def per_function(matrix: Float[Tensor, "P n columns"]) -> Float[Tensor, "T P O n"]:
         return matrix.to(dtype).mT.unflatten(1, (num_functions, outputs)).transpose(0, 1).contiguous()
 
+    linear_out = None
+    if root is not None:
+        along = root.square().unsqueeze(-1) * (scaled.mT @ alpha)
+        own = root.unsqueeze(-1) * drawn[:, num_features:-num_inducing]
+        linear_out = per_function(variance * along + sigma * own)
     scale = layer.kernel.argument_scale
     return PathwiseLayer(
         layer.kernel,
@@ -140,6 +150,7 @@ def _draw_layer(
         (features.frequency.mT / (2 * math.pi)).to(dtype).contiguous(),
         per_function(variance * alpha),
         per_function(sigma * (2.0 / num_features) ** 0.5 * normals[:, :num_features]),
+        linear_out,
     )
 
 
@@ -230,6 +241,8 @@ class PathwiseSampler:
             torch.sin(angles, out=waves[..., half:])
             torch.bmm(waves, feature_out[own], out=out[own])
             out[own].baddbmm_(correlations, kernel_out[own])
+        if layer.linear_out is not None:
+            out.baddbmm_(scaled, layer.linear_out[function].mT)
         return out
 
 

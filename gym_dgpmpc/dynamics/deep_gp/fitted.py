@@ -70,6 +70,7 @@ class FittedSizes(NamedTuple):
     num_samples: int
     num_inputs: int
     num_targets: int
+    linear: bool
 
 
 def take_fitted(state: StateDict, kernel: Kernel, sizes: FittedSizes, device: torch.device) -> Fitted:
@@ -84,11 +85,13 @@ def take_fitted(state: StateDict, kernel: Kernel, sizes: FittedSizes, device: to
     def take(name: str, *shape: int) -> Tensor:
         return take_tensor(state, name, shape, device)
 
-    shapes = {name: (chains, *shape) for name, shape in parameter_shapes(sizes.num_inducing, size).items()}
-    layers = (
-        Layer(kernel, **take_tensors(state, shapes, device, prefix=f"layers.{index}."))
-        for index in range(sizes.num_layers)
-    )
+    def take_layer(index: int) -> Layer:
+        linear = sizes.linear and index == sizes.num_layers - 1
+        shapes = parameter_shapes(sizes.num_inducing, size, linear=linear)
+        of_chains = {name: (chains, *shape) for name, shape in shapes.items()}
+        return Layer(kernel, **take_tensors(state, of_chains, device, prefix=f"layers.{index}."))
+
+    layers = (take_layer(index) for index in range(sizes.num_layers))
     model = DeepGP(tuple(layers), take("log_noise", chains, num_targets))
     normalisers = (
         take_normaliser(state, "inputs", size, device),

@@ -74,6 +74,8 @@ class DeepGPDynamics(Learner[Fitted]):
         num_layers: layers of the deep GP, L; with 1 it is an ordinary sparse GP.
         kernel: covariance function of every layer, from the smoothest functions to the roughest: rbf, matern72,
             matern52, matern32 or matern12.
+        linear: add a linear part to the last layer's kernel, whose slopes are inferred with all else: far from all
+            data the model goes on along a line, instead of back to the mean.
         num_inducing: inducing points per layer, M; more of them follow finer detail and cost more time.
         draw: how a world is drawn from the posterior: "pathwise" (whole functions), "joint" (values, jointly over the
             candidate sequences, as in the paper) or "marginal" (values, each candidate on its own).
@@ -95,8 +97,8 @@ class DeepGPDynamics(Learner[Fitted]):
             function alone.
         split_noise: where ``add_noise`` is on, tell the sensors' noise, which only blurs what is observed, from the
             process's, which adds up over a plan, as far as the data show it; otherwise all of it adds up.
-        compile: roll "pathwise" draws out in compiled code, several times faster; a C++ compiler builds it once in a
-            few seconds. PyTorch does it where there is no compiler, on a GPU, and for kernels of your own.
+        compile: train, and roll "pathwise" draws out, in compiled code, several times faster; a C++ compiler builds it
+            once in a few seconds. PyTorch does it where there is no compiler, on a GPU, and for kernels of your own.
         dtype: precision of rollouts; training and every factorisation are in float64.
         device: where tensors live.
         **inference: the settings of `InferenceSettings`, each as a keyword argument of its own.
@@ -124,6 +126,7 @@ class DeepGPDynamics(Learner[Fitted]):
         *,
         num_layers: int = 2,
         kernel: str = "matern32",
+        linear: bool = False,
         num_inducing: int = 100,
         draw: Draw = "pathwise",
         refresh: Refresh = "plan",
@@ -132,7 +135,7 @@ class DeepGPDynamics(Learner[Fitted]):
         training_iterations: int = 300,
         num_chains: int = 5,
         num_samples: int = 100,
-        sample_spacing: int = 5,
+        sample_spacing: int = 20,
         resample_samples: int = 5,
         relocate: bool = True,
         add_noise: bool = True,
@@ -165,7 +168,8 @@ class DeepGPDynamics(Learner[Fitted]):
         noise = {"add_noise": add_noise, "split_noise": split_noise}
         super().__init__(observation_size, action_size, observation_spec, dtype, device, **noise)
         self.kernel: Kernel = find_kernel(kernel)
-        self.num_layers, self.num_inducing, self.num_features = num_layers, num_inducing, num_features
+        self.num_layers, self.linear = num_layers, linear
+        self.num_inducing, self.num_features = num_inducing, num_features
         self.draw_kind, self.refresh = draw, refresh
         self.first_training_iterations, self.training_iterations = first_training_iterations, training_iterations
         self.num_chains, self.num_samples, self.sample_spacing = num_chains, num_samples, sample_spacing
@@ -174,7 +178,7 @@ class DeepGPDynamics(Learner[Fitted]):
         self.resample_samples = min(resample_samples, self._samples_of_chain)
         self.inference = InferenceSettings(**inference)
         self._follower: Follower | None = None  # of what was fitted, once it is followed
-        self.compile = compile and dtype == torch.float32 and self.device.type == "cpu"
+        self.compile = compile
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """Train all chains on all transitions, then take a fresh pool of posterior samples from them.
@@ -188,9 +192,8 @@ class DeepGPDynamics(Learner[Fitted]):
         normalisers, standardised = self._standardised(data)
         if self._fitted is None:
             iterations, settled = self.first_training_iterations, False
-            model = initial_model(
-                self.kernel, standardised, self.num_layers, self.num_inducing, self.num_chains, generator
-            )
+            sizes = self.num_layers, self.num_inducing, self.num_chains
+            model = initial_model(self.kernel, standardised, *sizes, generator, linear=self.linear)
             whitened = sghmc.init(standardised.x.new_zeros(self.num_chains, model.num_whitened()))
         else:
             iterations, settled, last = self.training_iterations, True, self._fitted
@@ -208,6 +211,7 @@ class DeepGPDynamics(Learner[Fitted]):
             generator,
             self.inference,
             settled=settled,
+            compile=self.compile,
             on_look=lambda done, loss: report(done, total, loss),
         )
         sampled = training.sample_pool(
@@ -220,6 +224,7 @@ class DeepGPDynamics(Learner[Fitted]):
             self.inference,
             trained.scale,
             lambda count: report(iterations + count * spacing, total, trained.negative_log_likelihood),
+            compile=self.compile,
         )
         factorised = factorise_all(trained.model)
         variance = factorised.model.noise_variance.mean(0)
@@ -249,7 +254,7 @@ class DeepGPDynamics(Learner[Fitted]):
             return {}
         position, inner = fitted.chain.position, fitted.factorised.model.num_inner()
         if self._follower is None:
-            self._follower = Follower(fitted.factorised, position[:, :inner])
+            self._follower = Follower(fitted.factorised.model, position[:, :inner], compile=self.compile)
         standardised = _Standardised(self._encode, data, fitted.normalisers)
         count = self._samples_of_chain
         try:
@@ -283,7 +288,8 @@ class DeepGPDynamics(Learner[Fitted]):
         if self.draw_kind == "pathwise":
             settings = posterior, coordinates, horizon, self.num_features, self.refresh
             noise = None if process_std is None else (process_std, blur)
-            if self.compile and compiled_rollout.is_available(self.kernel):
+            single = self.dtype == torch.float32 and self.device.type == "cpu"
+            if self.compile and single and compiled_rollout.is_available(self.kernel):
                 return CompiledPathwiseSampler(*settings, generator, noise)
             return PathwiseSampler(*settings, self.dtype, generator, noise)
         joint = self.draw_kind == "joint"
@@ -340,6 +346,7 @@ class DeepGPDynamics(Learner[Fitted]):
             num_samples=self._samples_of_chain,
             num_inputs=self.encoder.input_size,
             num_targets=self.encoder.target_size,
+            linear=self.linear,
         )
         self._fitted, self._follower = take_fitted(state, self.kernel, expected, self.device), None
 

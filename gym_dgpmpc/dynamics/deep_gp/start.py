@@ -24,12 +24,19 @@ MOST_CLUSTERED = 10_000
 
 
 def initial_model(
-    kernel: Kernel, data: Data, num_layers: int, num_inducing: int, num_chains: int, generator: torch.Generator
+    kernel: Kernel,
+    data: Data,
+    num_layers: int,
+    num_inducing: int,
+    num_chains: int,
+    generator: torch.Generator,
+    *,
+    linear: bool = False,
 ) -> DeepGP:
     """Hyperparameters of C chains before the first fit, for standardised data.
 
     Inducing inputs by k-means of the inputs, of each chain its own, in every layer (the inner layers start near the
-    identity); all else at the centres of `inference.priors`.
+    identity); all else at the centres of `inference.priors`. With ``linear`` the last layer's kernel has a linear part.
     """
     size = data.x.shape[1]
     rows = _rows_to_cluster(data.x, generator)
@@ -38,7 +45,8 @@ def initial_model(
 
     def layer(*, last: bool) -> Layer:
         log_variance = data.x.new_full((num_chains,), priors.log_variance_centre(last=last))
-        return Layer(kernel, centres.clone(), log_lengthscale.clone(), log_variance)
+        log_slope = torch.full_like(log_lengthscale, math.log(priors.SLOPE)) if last and linear else None
+        return Layer(kernel, centres.clone(), log_lengthscale.clone(), log_variance, log_slope)
 
     layers = tuple(layer(last=index == num_layers - 1) for index in range(num_layers))
     return DeepGP(layers, data.y.new_full((num_chains, data.y.shape[1]), math.log(priors.NOISE_VARIANCE)))
@@ -77,7 +85,8 @@ def restandardise(
 
     Inner layers live in the inputs' coordinates, so their inducing inputs and lengthscales follow the inputs' affine
     map and their (whitened, hence linear) inducing outputs its scale. The last layer's follow the targets' scale, of
-    which the kernel's variance takes the geometric mean; the shift of the targets' mean is left to training.
+    which the kernel's variance takes the geometric mean; the shift of the targets' mean is left to training. With a
+    linear part, which a shift of the inputs changes, the function is the same at the inducing inputs.
     """
     stretch = old[0].std / new[0].std
     shift = (old[0].mean - new[0].mean) / new[0].std
@@ -92,7 +101,11 @@ def restandardise(
     ]
     layers[-1] = layers[-1]._replace(log_variance=layers[-1].log_variance + 2 * common)
     *inner, last = model.split(whitened)
-    scaled = [v * stretch for v in inner] + [last * (stretch_out / common.exp())]
+    last = last * (stretch_out / common.exp())
+    if layers[-1].log_slope is not None:
+        values = (common.exp() * factorise(model.layers[-1])) @ last
+        last = torch.linalg.solve_triangular(factorise(layers[-1]), values, upper=False)
+    scaled = [v * stretch for v in inner] + [last]
     return (
         DeepGP(tuple(layers), model.log_noise + 2 * stretch_out.log()),
         torch.cat([v.flatten(-2) for v in scaled], dim=-1),

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from gym_dgpmpc import compiler
 from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.bounds import SeenTargets
@@ -53,6 +54,7 @@ class Draw:
         offset=0.0,
         with_noise=False,
         seen=None,
+        linear=False,
     ):
         generator = seeded(3)
         encoder = Encoder(3, 2, spec)
@@ -64,7 +66,7 @@ class Draw:
         inputs.mean[: len(encoder.plain)] += (torch.zeros(3).double() + offset)[encoder.plain]
         targets.mean.add_(((torch.zeros(3).double() + offset) * (1.0 - encoder.carried))[encoder.predicted])
         sizes = num_layers, encoder.input_size, encoder.target_size, num_inducing
-        model = chains(*(make_model(*sizes, generator) for _ in range(PARTICLES)))
+        model = chains(*(make_model(*sizes, generator, linear=linear) for _ in range(PARTICLES)))
         names = kernel if isinstance(kernel, tuple) else (kernel,) * num_layers
         layers = zip(model.layers, names, strict=True)
         model = model._replace(layers=tuple(layer._replace(kernel=KERNELS[name]) for layer, name in layers))
@@ -104,6 +106,15 @@ def errors(draw, actions):
     exact = torch.stack([draw.double(found[t].double(), actions[:, t].double(), t) for t in range(HORIZON)])
     by_torch = torch.stack([draw.single(found[t].clone(), actions[:, t], t) for t in range(HORIZON)])
     return (found[1:] - exact).abs().max(), (by_torch - exact).abs().max()
+
+
+@pytest.mark.parametrize("num_layers", [1, 3])
+@pytest.mark.parametrize("refresh", ["step", "plan"])
+def test_a_linear_part_is_as_exact(num_layers, refresh):
+    draw = Draw("matern32", num_layers, refresh=refresh, linear=True)
+    compiled, by_torch = errors(draw, draw.actions(40))
+    assert compiled < max(10 * by_torch, 1e-5)
+    assert all((layer.linear_out is not None) == (layer is draw.single.layers[-1]) for layer in draw.single.layers)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -215,7 +226,7 @@ class Own(RBF):
 def test_a_kernel_that_the_compiled_code_does_not_have_is_left_to_pytorch(monkeypatch):
     """With one warning, and none where compiled code is not wanted; the plans are the same."""
     monkeypatch.setitem(KERNELS, "own", Own())
-    compiled_rollout._warn_of_unknown_kernel.cache_clear()
+    compiler.warn_once.cache_clear()
     observation = normal(seeded(), 10, 3).float()
     worlds = []
     for kernel, compile in (("own", True), ("rbf", False), ("own", False), ("own", True)):

@@ -36,10 +36,11 @@ every_kernel = pytest.mark.parametrize("kernel", KERNELS)
 class World:
     """Two small models, a sample of the inducing outputs of each, and the points at which functions are looked at."""
 
-    def __init__(self, kernel, num_layers):
+    def __init__(self, kernel, num_layers, *, linear=False):
         generator = seeded(7)
         self.kernel, self.num_layers = kernel, num_layers
-        self.models = [make_model(num_layers, 3, 2, NUM_INDUCING, generator, kernel) for _ in range(2)]
+        sizes = num_layers, 3, 2, NUM_INDUCING
+        self.models = [make_model(*sizes, generator, kernel, linear=linear) for _ in range(2)]
         self.factorised = factorise_all(chains(*self.models))
         flat = normal(generator, 2, self.models[0].num_whitened())
         self.whitened = self.factorised.model.split(flat)
@@ -153,6 +154,18 @@ def test_functions_drawn_for_a_plan_are_joint_over_time(kernel, num_layers):
     late = world.values(sampler, 2400, 3, points=[1, 3])
     drawn = np.stack([early[:, :, 0], late[:, :, 0], early[:, :, 1], late[:, :, 1]], axis=2)
     check_law(world, drawn, joint=True)
+
+
+@pytest.mark.usefixtures("unchecked")
+@both_depths
+@pytest.mark.parametrize("draw", ["joint", "step", "plan"])
+def test_a_linear_part_is_drawn_too(num_layers, draw):
+    world = World("matern32", num_layers, linear=True)
+    if draw == "joint":
+        sampler = ConditionalSampler(world.posterior(2400), COORDINATES, seeded(), joint=True)
+    else:
+        sampler = pathwise(world, draw)
+    check_law(world, world.values(sampler, 2400), joint=True)
 
 
 @pytest.mark.usefixtures("unchecked")

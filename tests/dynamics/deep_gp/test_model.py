@@ -68,6 +68,39 @@ def test_the_same_seed_gives_the_same_run(draw):
     assert not torch.equal(run(0), run(1))
 
 
+@pytest.mark.parametrize("num_layers", [1, 2])
+def test_with_a_linear_part_a_line_is_known_far_from_all_data(num_layers):
+    """Four times as far as the data go; without it the model has nothing to say there but its prior."""
+    observation = torch.rand(60, 1, generator=seeded(), dtype=torch.float64) * 2 - 1
+    action = torch.rand(60, 1, generator=seeded(1), dtype=torch.float64) * 2 - 1
+    data = Transitions(observation, action, observation + 0.3 * observation - 0.2 * action)
+    far = torch.tensor([[4.0], [-4.0]]).double()
+    tested = Transitions(far, torch.zeros_like(far), 1.3 * far)
+    changes, spreads = [], []
+    for linear in (True, False):
+        sizes = {"num_layers": num_layers, "num_inducing": 20, "first_training_iterations": 150}
+        model = DeepGPDynamics(1, 1, **(TINY | sizes), linear=linear)
+        model.fit(data, seeded(2))
+        found = model.predictive(tested, seeded(3))
+        changes.append(found.mean.squeeze(-1) / 1.2 * far.sign().squeeze(-1))
+        spreads.append(found.variance.sqrt().squeeze(-1) / 1.2)
+    assert ((changes[0] - 1.0).abs() < 3 * spreads[0]).all() and changes[0].min() > 0.5
+    assert changes[1].max() < 0.5
+
+
+@pytest.mark.parametrize("num_layers", [1, 2])
+def test_a_linear_part_goes_through_fits_files_and_episodes(num_layers):
+    model = fitted(linear=True, num_layers=num_layers)
+    generator = seeded(4)
+    model.fit(pendulum.simulate(40), generator)
+    model.resample(pendulum.simulate(41), generator)
+    other = tiny(linear=True, num_layers=num_layers)
+    other.load_state_dict(model.state_dict())
+    assert torch.equal(predictions(other), predictions(model))
+    slopes = [name for name in model.state_dict() if name.endswith("log_slope")]
+    assert slopes == [f"layers.{num_layers - 1}.log_slope"]
+
+
 @pytest.mark.parametrize("num_steps", [1, 2, 5])
 def test_fewer_transitions_than_inducing_inputs_are_enough(num_steps):
     model = fitted(num_steps)
@@ -299,6 +332,7 @@ def test_an_unfitted_model_saves_and_loads_too():
     [
         ({"num_inducing": 9}, "layers.0.inducing_inputs", (2, 9, 4), (2, 8, 4)),
         ({"num_layers": 3}, "layers.2.inducing_inputs", (2, 8, 4), None),
+        ({"linear": True}, "layers.1.log_slope", (2, 4), None),
         ({"num_samples": 10}, "pool", (5, 2, 48), (4, 2, 48)),
         ({"num_chains": 4}, "layers.0.inducing_inputs", (4, 8, 4), (2, 8, 4)),
     ],

@@ -45,9 +45,30 @@ def test_restandardising_keeps_the_function_of_raw_inputs(kernel, num_layers):
     torch.testing.assert_close(moved.log_noise.exp() * new[1].std.square(), noise)
 
 
-def test_restandardising_to_the_same_coordinates_changes_nothing():
+def test_with_a_linear_part_restandardising_keeps_the_inducing_outputs():
     generator = seeded(1)
-    model = make_model(2, 3, 2, 6, generator)
+    model = make_model(1, 3, 2, 6, generator, linear=True)
+    whitened = normal(generator, model.num_whitened())
+
+    def normalisers(seed):
+        twin = seeded(seed)
+        return tuple(Normaliser(normal(twin, n), 0.5 + normal(twin, n).square()) for n in (3, 2))
+
+    old, new = normalisers(2), normalisers(3)
+    moved, moved_whitened = restandardise(model, whitened, old, new)
+    outputs = [
+        factorise_all(each).factors[0] @ each.split(v)[0] * targets.std
+        for each, v, (_, targets) in ((model, whitened, old), (moved, moved_whitened, new))
+    ]
+    torch.testing.assert_close(outputs[1], outputs[0], rtol=1e-9, atol=1e-9)
+    raw = old[0].inverse(model.layers[0].inducing_inputs)
+    torch.testing.assert_close(new[0].inverse(moved.layers[0].inducing_inputs), raw, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_restandardising_to_the_same_coordinates_changes_nothing(linear):
+    generator = seeded(1)
+    model = make_model(2, 3, 2, 6, generator, linear=linear)
     whitened = normal(generator, model.num_whitened())
     same = (
         Normaliser(normal(generator, 3), torch.ones(3).double()),

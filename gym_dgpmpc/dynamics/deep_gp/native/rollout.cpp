@@ -4,7 +4,8 @@
 // particle and a range of candidates; several threads may do so at the same time. Every candidate's trajectory is
 // independent of the others, so a call runs through all steps by itself. Per step and layer each point goes through
 //
-//     f(x) = sum_m k(argument_m(x)) kernel_out_m + sum_i cos(2 pi turns_i(x)) cosine_out_i + sin(2 pi turns_i(x)) sine_out_i
+//     f(x) = sum_m k(argument_m(x)) kernel_out_m
+//          + sum_i (cos(2 pi turns_i(x)) cosine_out_i + sin(2 pi turns_i(x)) sine_out_i) + linear_out x
 //
 // with argument_m = offset_m + c |x|^2 + centre_m . x and turns_i = frequency_i . x. Blocks of up to VECTORS LANES points
 // and UNITS inducing inputs (or WAVES frequencies) stay in registers from the first product over the kernel to the second
@@ -51,6 +52,7 @@ struct Layer {
   const float *frequencies;   // [P, D, F / 2], in turns
   const float *kernel_out;    // [T, P, O, M]
   const float *feature_out;   // [T, P, O, F]: of all cosines, then of all sines
+  const float *linear_out;    // [T, P, O, D], or null
 };
 
 struct Task {
@@ -315,6 +317,7 @@ struct Functions {
   int64_t unit_blocks, wave_blocks;  // M / UNITS and F / 2 / WAVES, what is missing padded with zeros
   float *units;                      // [unit_blocks, 1 + D + O, UNITS]: offsets, centres, and what goes out
   float *waves;                      // [wave_blocks, D + 2 O, WAVES]: frequencies, and what goes out
+  const float *linear;               // [O, D], or null
 };
 
 // One block of columns of the first product, for V LANES points, added to the values.
@@ -334,7 +337,12 @@ void evaluate(const Functions &of, int64_t inputs, const vec *x, vec *out) {
   for (int64_t d = 0; d < inputs; d++)
     for (int v = 0; v < V; v++) square[v] = fused(x[d * V + v], x[d * V + v], square[v]);
   for (int v = 0; v < V; v++) square[v] *= of.argument_scale;
-  for (int64_t i = 0; i < of.outputs * V; i++) out[i] = vec{};
+  for (int64_t o = 0; o < of.outputs; o++)
+    for (int v = 0; v < V; v++) {
+      vec sum = {};
+      for (int64_t d = 0; of.linear && d < inputs; d++) sum = fused(x[d * V + v], of.linear[o * inputs + d], sum);
+      out[o * V + v] = sum;
+    }
 
   const float *weights = of.units;
   for (int64_t block = 0; block < of.unit_blocks; block++) {
@@ -418,6 +426,7 @@ void pack(const Task &task, const Layer &layer, int64_t particle, int64_t functi
   of.argument_scale = (float)(layer.argument_scale * unit);
   of.outputs = layer.outputs;
   of.inverse_lengthscale = layer.inverse_lengthscale + particle * inputs;
+  of.linear = layer.linear_out ? layer.linear_out + function * layer.outputs * inputs : nullptr;
   float *to = of.units;
   for (int64_t m = 0; m < units; m += UNITS) {
     to = packed<UNITS>(layer.offsets + particle * units, 1, units, m, unit, to);
@@ -597,7 +606,7 @@ Scratch laid_out(const Task &task, int64_t count, Memory &memory) {
     const int64_t out = task.layers[l].outputs;
     float *first = memory.take<float>(units * (1 + inputs + out) * UNITS);
     float *second = memory.take<float>(waves * (inputs + 2 * out) * WAVES);
-    if (memory.base) scratch.functions[l] = {0.0f, 0, nullptr, units, waves, first, second};
+    if (memory.base) scratch.functions[l] = {0.0f, 0, nullptr, units, waves, first, second, nullptr};
   }
   return scratch;
 }

@@ -1,9 +1,10 @@
-"""Builds the package's C++ source once, with the compiler of the machine that it runs on, and loads it.
+"""Builds the package's C++ sources once, with the compiler of the machine that it runs on, and loads them.
 
 The result is kept in the user's cache folder (`XDG_CACHE_HOME`, by default `~/.cache`), under a name that says which
 source, compiler, flags and processor it was built from and for, and which bytes it holds: a file that does not hold
 them is built anew, for loading it may kill the process. Where that folder cannot be used, a temporary one can. Used by
-`compiled_rollout.py`; without a compiler the package works all the same, only slower.
+`dynamics/deep_gp/compiled_rollout.py` and `inference/compiled_layers.py`; without a compiler the package works all the
+same, only slower. Compiled code is called through `in_threads`.
 """
 
 import atexit
@@ -16,14 +17,13 @@ import shutil
 import subprocess
 import tempfile
 import warnings
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 
-FLAGS = (
-    "-std=c++17", "-O3", "-march=native", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-shared",
-    "-fPIC",
-)  # fmt: skip
+FLAGS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 COMPILERS = ("c++", "g++", "clang++")
 BUILD_TIMEOUT = 120.0
 """Seconds after which a compiler is taken to hang."""
@@ -34,18 +34,35 @@ class CompilerError(RuntimeError):
 
 
 @functools.cache
-def load(name: str) -> ctypes.CDLL | None:
-    """The library built from ``native/NAME.cpp``; None, with one warning, if it cannot be built."""
-    source = files("gym_dgpmpc.dynamics.deep_gp").joinpath("native", f"{name}.cpp").read_bytes()
+def load(source: str, *flags: str) -> ctypes.CDLL | None:
+    """The library built from a source, "room/native/name.cpp"; None, with one warning, if it cannot be built.
+
+    Args:
+        flags: of the compiler, beside `FLAGS`.
+    """
+    path = Path(source)
     try:
-        return _load(name, source)
+        return _load(path.stem, files("gym_dgpmpc").joinpath(*path.parts).read_bytes(), flags)
     except (CompilerError, OSError, subprocess.SubprocessError) as error:
-        warnings.warn(
-            f"planning does without compiled code, several times slower, because {error}. Install a C++ compiler "
-            "(g++ or clang++), or name one in the environment variable CXX; compile=False silences this warning",
-            stacklevel=2,
-        )
+        warn_once(f"{error}. Install a C++ compiler (g++ or clang++), or name one in the environment variable CXX")
         return None
+
+
+@functools.cache
+def warn_once(reason: str) -> None:
+    """Say why there is no compiled code, once for each reason."""
+    warnings.warn(
+        f"planning or training does without compiled code, several times slower, because {reason}; compile=False "
+        "silences this warning",
+        stacklevel=3,
+    )
+
+
+def in_threads(call: Callable[[int, int], int], ranges: Sequence[tuple[int, int]]) -> int:
+    """The sum of what ``call(first, last)`` returns for all ranges, each of them on a thread of its own."""
+    if len(ranges) == 1:
+        return call(*ranges[0])
+    return sum(_threads(len(ranges)).map(lambda each: call(*each), ranges))
 
 
 def find_compiler() -> list[str]:
@@ -80,14 +97,23 @@ def cache_folder() -> Path:
     return folder
 
 
-def _load(name: str, source: bytes) -> ctypes.CDLL:
+@functools.cache
+def _threads(num_threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(num_threads, thread_name_prefix="compiled")
+
+
+if hasattr(os, "register_at_fork"):  # a forked child inherits the pools, but none of their threads
+    os.register_at_fork(after_in_child=_threads.cache_clear)
+
+
+def _load(name: str, source: bytes, flags: Sequence[str]) -> ctypes.CDLL:
     """The library: the one that is kept, else a new one.
 
     Raises:
         CompilerError, subprocess.SubprocessError: it cannot be built.
         OSError: nowhere can it be written and loaded from.
     """
-    command = [*find_compiler(), *FLAGS, "-x", "c++", "-"]
+    command = [*find_compiler(), *FLAGS, *flags, "-x", "c++", "-"]
     # All that the compiler predefines with these flags: its version and the processor's instructions among them.
     described = _run([*command, "-dM", "-E"], b"")
     digest = hashlib.sha256(b"\0".join([source, " ".join(command).encode(), described])).hexdigest()

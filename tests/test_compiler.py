@@ -12,22 +12,27 @@ from pathlib import Path
 import pytest
 import torch
 
-from gym_dgpmpc.dynamics.deep_gp import compiled_rollout, compiler
+from gym_dgpmpc import compiler
+from gym_dgpmpc.dynamics.deep_gp import compiled_rollout
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
+from gym_dgpmpc.inference import compiled_layers
 from gym_dgpmpc.types import TrajectorySampler, Transitions
 from tests.oracles.models import normal, seeded
 
 needs_compiler = pytest.mark.skipif(not compiled_rollout.is_available(), reason="no C++ compiler works here")
+
+SOURCE = compiled_rollout.SOURCE
+REMEMBERED = compiler.load, compiler.warn_once, compiled_rollout._library, compiled_layers._library
 
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch, tmp_path):
     """A cache of its own for every test, and no memory of what was loaded before."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    for remembered in (compiler.load, compiled_rollout._library):
+    for remembered in REMEMBERED:
         remembered.cache_clear()
     yield
-    for remembered in (compiler.load, compiled_rollout._library):
+    for remembered in REMEMBERED:
         remembered.cache_clear()
 
 
@@ -42,39 +47,38 @@ def test_without_a_compiler_one_warning_and_the_same_worlds(monkeypatch, command
     monkeypatch.setenv("CXX", command)
     model = DeepGPDynamics(3, 2, num_inducing=5, first_training_iterations=2, num_samples=2)
     observation = normal(seeded(), 10, 3).float()
-    model.fit(Transitions(observation, observation[:, :2], observation), seeded())
     with pytest.warns(UserWarning, match=complaint):
+        model.fit(Transitions(observation, observation[:, :2], observation), seeded())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         world = model.draw(2, 3, seeded())
     assert not isinstance(world, TrajectorySampler)
     assert world(observation.expand(2, -1, -1).clone(), observation[:, :2], 0).isfinite().all()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        model.draw(2, 3, seeded())
 
 
 def test_who_does_not_want_it_is_not_warned(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     model = DeepGPDynamics(3, 2, num_inducing=5, first_training_iterations=2, num_samples=2, compile=False)
     observation = normal(seeded(), 10, 3).float()
-    model.fit(Transitions(observation, observation[:, :2], observation), seeded())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        model.fit(Transitions(observation, observation[:, :2], observation), seeded())
         model.draw(2, 3, seeded())
 
 
 @needs_compiler
 def test_is_built_once(tmp_path, monkeypatch):
-    assert compiler.load("rollout") is not None
+    assert compiler.load(SOURCE) is not None
     (library,) = (tmp_path / "gym_dgpmpc").iterdir()
     built = library.stat().st_mtime_ns
     compiler.load.cache_clear()
-    assert compiler.load("rollout") is not None
+    assert compiler.load(SOURCE) is not None
     (again,) = (tmp_path / "gym_dgpmpc").iterdir()
     assert (again, again.stat().st_mtime_ns) == (library, built)
     # Other flags, another library: what was built for another machine is never loaded.
     monkeypatch.setattr(compiler, "FLAGS", (*compiler.FLAGS, "-DOTHER"))
     compiler.load.cache_clear()
-    assert compiler.load("rollout") is not None
+    assert compiler.load(SOURCE) is not None
     assert len(list((tmp_path / "gym_dgpmpc").iterdir())) == 2
 
 
@@ -84,7 +88,7 @@ def test_a_cache_that_others_can_write_to_is_not_used(tmp_path):
     folder = compiler.cache_folder()
     folder.chmod(0o777)
     with pytest.warns(UserWarning, match=re.escape(str(folder))):
-        assert compiler.load("rollout") is None
+        assert compiler.load(SOURCE) is None
     folder.chmod(0o700)
     assert stat.S_IMODE(compiler.cache_folder().stat().st_mode) == 0o700
 
@@ -93,14 +97,14 @@ def load_in_another_process(**environment):
     """What a new process says that loads the library and counts the files in TMPDIR while it has it."""
     program = """
 import os
-from gym_dgpmpc.dynamics.deep_gp import compiler
-assert compiler.load("rollout") is not None
+from gym_dgpmpc import compiler
+assert compiler.load('dynamics/deep_gp/native/rollout.cpp') is not None
 print(len(os.listdir(os.environ["TMPDIR"])))
 """
     return subprocess.run(
         [sys.executable, "-c", program],
         env={name: value for name, value in (os.environ | environment).items() if value is not None},
-        cwd=Path(__file__).parents[3],
+        cwd=Path(__file__).parents[1],
         capture_output=True,
         text=True,
         timeout=120,
@@ -145,7 +149,7 @@ def test_a_cache_that_cannot_be_used_is_done_without(failing, tmp_path, monkeypa
         monkeypatch.setattr(compiler.ctypes, "CDLL", refuse_the_cache)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert compiler.load("rollout").points() > 0
+        assert compiler.load(SOURCE).points() > 0
 
 
 def test_without_any_folder_there_is_the_warning(monkeypatch):
@@ -155,14 +159,14 @@ def test_without_any_folder_there_is_the_warning(monkeypatch):
     monkeypatch.setattr(compiler.tempfile, "TemporaryDirectory", fail)
     monkeypatch.setattr(compiler, "find_compiler", lambda: ["echo"])
     with pytest.warns(UserWarning, match="temporary directory"):
-        assert compiler.load("rollout") is None
+        assert compiler.load(SOURCE) is None
 
 
 @needs_compiler
 @pytest.mark.parametrize("size", [4096, 0])
 def test_a_damaged_library_is_built_anew(size, tmp_path):
     """Loading one that was cut would kill the process: its pages are missing when they are touched."""
-    assert compiler.load("rollout") is not None
+    assert compiler.load(SOURCE) is not None
     (library,) = (tmp_path / "gym_dgpmpc").iterdir()
     whole = library.read_bytes()
     library.unlink()  # not cut where it is: this process has it mapped
@@ -178,16 +182,13 @@ def test_a_damaged_library_is_built_anew(size, tmp_path):
 def test_a_compiler_that_writes_nothing_is_named(monkeypatch):
     monkeypatch.setenv("CXX", "echo")
     with pytest.warns(UserWarning, match="echo wrote no library"):
-        assert compiler.load("rollout") is None
+        assert compiler.load(SOURCE) is None
 
 
 def test_memory_that_cannot_be_had_is_an_error(monkeypatch):
     """The compiled code says by its result that it could not allocate; nothing is then returned as if computed."""
 
     class Library:
-        def units(self):
-            return 4
-
         def points(self):
             return 8
 
@@ -198,6 +199,7 @@ def test_memory_that_cannot_be_had_is_an_error(monkeypatch):
             return 1
 
     monkeypatch.setattr(compiled_rollout, "_library", functools.cache(Library))
+    monkeypatch.setattr(compiled_layers, "can_take", lambda *_: False)
     model = DeepGPDynamics(3, 2, num_inducing=5, first_training_iterations=2, num_samples=2, compile=True)
     observation = normal(seeded(), 10, 3).float()
     model.fit(Transitions(observation, observation[:, :2], observation), seeded())
