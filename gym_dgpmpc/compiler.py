@@ -34,11 +34,15 @@ class CompilerError(RuntimeError):
 
 
 @functools.cache
-def load(source: str) -> ctypes.CDLL | None:
-    """The library built from a source, "room/native/name.cpp"; None, with one warning, if it cannot be built."""
+def load(source: str, *flags: str) -> ctypes.CDLL | None:
+    """The library built from a source, "room/native/name.cpp"; None, with one warning, if it cannot be built.
+
+    Args:
+        flags: of the compiler, beside `FLAGS`.
+    """
     path = Path(source)
     try:
-        return _load(path.stem, files("gym_dgpmpc").joinpath(*path.parts).read_bytes())
+        return _load(path.stem, files("gym_dgpmpc").joinpath(*path.parts).read_bytes(), flags)
     except (CompilerError, OSError, subprocess.SubprocessError) as error:
         warn_once(f"{error}. Install a C++ compiler (g++ or clang++), or name one in the environment variable CXX")
         return None
@@ -102,14 +106,14 @@ if hasattr(os, "register_at_fork"):  # a forked child inherits the pools, but no
     os.register_at_fork(after_in_child=_threads.cache_clear)
 
 
-def _load(name: str, source: bytes) -> ctypes.CDLL:
+def _load(name: str, source: bytes, flags: Sequence[str]) -> ctypes.CDLL:
     """The library: the one that is kept, else a new one.
 
     Raises:
         CompilerError, subprocess.SubprocessError: it cannot be built.
         OSError: nowhere can it be written and loaded from.
     """
-    command = [*find_compiler(), *FLAGS, "-x", "c++", "-"]
+    command = [*find_compiler(), *FLAGS, *flags, "-x", "c++", "-"]
     # All that the compiler predefines with these flags: its version and the processor's instructions among them.
     described = _run([*command, "-dM", "-E"], b"")
     digest = hashlib.sha256(b"\0".join([source, " ".join(command).encode(), described])).hexdigest()

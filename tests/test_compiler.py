@@ -149,7 +149,7 @@ def test_a_cache_that_cannot_be_used_is_done_without(failing, tmp_path, monkeypa
         monkeypatch.setattr(compiler.ctypes, "CDLL", refuse_the_cache)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert compiler.load(SOURCE).units() > 0
+        assert compiler.load(SOURCE).points() > 0
 
 
 def test_without_any_folder_there_is_the_warning(monkeypatch):
@@ -189,9 +189,6 @@ def test_memory_that_cannot_be_had_is_an_error(monkeypatch):
     """The compiled code says by its result that it could not allocate; nothing is then returned as if computed."""
 
     class Library:
-        def units(self):
-            return 4
-
         def points(self):
             return 8
 

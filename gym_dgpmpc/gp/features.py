@@ -17,14 +17,14 @@ from gym_dgpmpc.gp.kernels import Kernel
 
 
 class Features(NamedTuple):
-    """Frequencies for unit lengthscales, and phases, of F random features over D inputs, for each of P draws."""
+    """Frequencies for unit lengthscales of F random features over D inputs, for each of P draws."""
 
-    frequency: Float[Tensor, "P F D"]
-    phase: Float[Tensor, "F"]
+    frequency: Float[Tensor, "P half_F D"]
 
     def __call__(self, x: Float[Tensor, "P n D"]) -> Float[Tensor, "P n F"]:
-        """phi(x) for inputs already divided by the lengthscales; unit kernel variance."""
-        return torch.cos(x @ self.frequency.mT + self.phase) * (2.0 / self.phase.numel()) ** 0.5
+        """phi(x) for inputs already divided by the lengthscales, all cosines, then all sines; unit kernel variance."""
+        angle = x @ self.frequency.mT
+        return torch.cat([angle.cos(), angle.sin()], dim=-1) / math.sqrt(angle.shape[-1])
 
 
 def draw_features(
@@ -35,14 +35,11 @@ def draw_features(
     generator: torch.Generator,
     dtype: torch.dtype = torch.float64,
 ) -> Features:
-    """F features for each of P draws: F / 2 frequencies from the spectral density, each with the phases 0 and -pi / 2.
+    """F features for each of P draws, of F / 2 frequencies from the spectral density.
 
     Args:
         num_features: F, a multiple of 2.
     """
     half = num_features // 2
     frequency = kernel.draw_frequencies(num_draws * half, input_size, generator, dtype)
-    frequency = frequency.view(num_draws, half, input_size).repeat(1, 2, 1)
-    phase = torch.zeros(num_features, dtype=dtype, device=generator.device)
-    phase[half:] = -0.5 * math.pi
-    return Features(frequency, phase)
+    return Features(frequency.view(num_draws, half, input_size))

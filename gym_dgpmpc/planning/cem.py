@@ -36,8 +36,9 @@ def truncated_normal(
     With U uniform on [-1, 1), z = sqrt(2) erfinv(U erf(2 / sqrt 2)). The argument of erfinv stays within +-0.9545, so
     no draw is infinite in any precision.
     """
-    uniform = torch.rand(shape, generator=generator, device=device, dtype=dtype).mul_(2.0).sub_(1.0)
-    noise = uniform.mul_(math.erf(TRUNCATION / math.sqrt(2.0))).erfinv_().mul_(math.sqrt(2.0))
+    within = math.erf(TRUNCATION / math.sqrt(2.0))
+    uniform = torch.rand(shape, generator=generator, device=device, dtype=dtype)
+    noise = uniform.mul_(2.0 * within).sub_(within).erfinv_().mul_(math.sqrt(2.0))
     return noise.clamp_(-TRUNCATION, TRUNCATION)
 
 
@@ -49,14 +50,14 @@ def elite_shares(scores: Float[Tensor, " K"], num_elites: int) -> Float[Tensor, 
     the objective says nothing. A score that is not finite has no share.
     """
     # topk ranks NaN highest, hence the replacement before it.
-    ranked = scores.masked_fill(~scores.isfinite(), -math.inf)
+    ranked = scores.where(scores.isfinite(), -math.inf)
     best = ranked.topk(num_elites).values
-    valid = best.isfinite()
-    last = best.masked_fill(~valid, math.inf).min()
+    valid = best > -math.inf
+    last = best.where(valid, math.inf).min()
     above, tied = ranked > last, ranked == last
-    places = valid.sum() - above.sum()
-    share = above.to(scores.dtype) + tied.to(scores.dtype) * (places / tied.sum().clamp(min=1))
-    return share / valid.sum().clamp(min=1)
+    num_valid, num_above, num_tied = valid.sum(), above.sum(), tied.sum()
+    share = above + tied * ((num_valid - num_above) / num_tied.clamp(min=1)).to(scores.dtype)
+    return share / num_valid.clamp(min=1)
 
 
 def checked_elites(num_elites: int | None, num_candidates: int) -> int:
@@ -85,10 +86,9 @@ def refitted(
     m <- a m + (1 - a) mean(elites), v <- a v + (1 - a) var(elites), with the population variance.
     """
     weight = share.to(mean.dtype)
-    elite_mean = torch.einsum("k,kha->ha", weight, candidates)
-    elite_variance = torch.einsum("k,kha->ha", weight, (candidates - elite_mean).square())
-    mean = smoothing * mean + (1.0 - smoothing) * elite_mean
-    return mean, smoothing * variance + (1.0 - smoothing) * elite_variance
+    elite_mean = torch.tensordot(weight, candidates, 1)
+    elite_variance = torch.tensordot(weight, (candidates - elite_mean).square_(), 1)
+    return elite_mean.lerp(mean, smoothing), elite_variance.lerp(variance, smoothing)
 
 
 class GaussianPlan(NamedTuple):
@@ -189,6 +189,7 @@ class CEM:
         low, high = self.action_low, self.action_high
         mean, variance = plan.mean.clamp(low, high), plan.std.square()
         shape = (self.num_candidates, self.horizon, low.shape[0])
+        narrowest = torch.where(low == high, math.inf, self.min_std * (high - low))
         num_nonfinite, iterations_done, expected_return = 0, 0, math.nan
         for iteration in iterations(self.num_iterations, deadline):
             # Sample candidates from the truncated normal; the cap on its std keeps +-2 std within the bounds, so the
@@ -196,7 +197,7 @@ class CEM:
             room = torch.minimum(mean - low, high - mean)
             std = torch.minimum(variance.sqrt(), room / TRUNCATION)
             noise = truncated_normal(shape, generator, device=low.device, dtype=low.dtype)
-            candidates = (mean + std * noise).clamp(low, high)
+            candidates = (mean + std * noise).clamp_(low, high)
 
             # Score them, select the elites and refit.
             scores = scored(objective, candidates)
@@ -205,8 +206,8 @@ class CEM:
 
             # All that the host must know, in its one synchronisation of the iteration.
             finite = scores.isfinite()
-            narrow = ((variance.sqrt() < self.min_std * (high - low)) | (low == high)).all()
-            value = (share * scores.masked_fill(~finite, 0.0)).sum()
+            narrow = (variance.sqrt() < narrowest).all()
+            value = share @ scores.where(finite, 0.0)
             num_finite, is_narrow, expected_return = torch.stack([finite.sum(), narrow, value]).tolist()
             num_nonfinite += self.num_candidates - int(num_finite)
             if num_finite == 0:

@@ -82,9 +82,11 @@ def particle_returns(
     action = actions.to(states).transpose(0, 1).unsqueeze(1).expand(*batch, -1)
     reward = reward_fn(observation, action, next_observation)
     _check_output("reward_fn", reward, batch, "floating-point")
-    # Zero where the whole state is finite and NaN elsewhere, in two passes over the states.
-    poison = (next_observation * 0.0).sum(dim=-1)
-    reward = reward.to(states.dtype) + poison
+    reward = reward.to(states.dtype)
+    # As a rule one pass tells that all states are finite, as their sum is; a GPU would have to be waited for.
+    if states.device.type != "cpu" or not bool(next_observation.sum().isfinite()):
+        # Zero where the whole state is finite and NaN elsewhere, in two passes over the states.
+        reward = reward + (next_observation * 0.0).sum(dim=-1)
     if terminated_fn is not None:
         terminated = terminated_fn(next_observation)
         _check_output("terminated_fn", terminated, batch, "boolean")

@@ -36,10 +36,9 @@ class PathwiseLayer(NamedTuple):
     inverse_lengthscale: Float[Tensor, "P D"]
     centres: Float[Tensor, "P D M"]  # from x to the kernel's argument, with ...
     offsets: Float[Tensor, "P M"]  # ... and the factor of |x|^2, which is the kernel's `argument_scale`
-    frequencies: Float[Tensor, "P D F"]  # from x to the features' phases, in turns
-    phases: Float[Tensor, "P F"]
+    frequencies: Float[Tensor, "P D half_F"]  # from x to the features' angles, in turns
     kernel_out: Float[Tensor, "T P O M"]  # sigma^2 alpha; T = H with refresh="step", else 1
-    feature_out: Float[Tensor, "T P O F"]  # sigma sqrt(2 / F) w
+    feature_out: Float[Tensor, "T P O F"]  # sigma sqrt(2 / F) w, of all cosines, then of all sines
     linear_out: Float[Tensor, "T P O D"] | None  # of a linear part, for x over the lengthscales
 
 
@@ -52,7 +51,6 @@ class _Layer(ctypes.Structure):
         ("centres", _Floats),
         ("offsets", _Floats),
         ("frequencies", _Floats),
-        ("phases", _Floats),
         ("kernel_out", _Floats),
         ("feature_out", _Floats),
         ("linear_out", _Floats),
@@ -115,11 +113,10 @@ class CompiledRollout:
         library = _library()
         if library is None:
             raise RuntimeError("no compiled code on this machine: check is_available() first")
-        self._library, units = library, int(library.units())
-        encoder, first = coordinates.encoder, layers[0]
+        self._library, encoder, first = library, coordinates.encoder, layers[0]
         self._coordinates, self._noise = coordinates, noise
         self._kept_alive: list[Tensor] = []  # the memory that the structures point into
-        self._layers = (_Layer * len(layers))(*(self._packed(layer, units) for layer in layers))
+        self._layers = (_Layer * len(layers))(*map(self._described, layers))
         vectors = encoder.spec.body_frame
         along_body = {x: (FORWARDS, k) for k, (_, x, _) in enumerate(vectors)}
         along_body |= {y: (LEFTWARDS, k) for k, (_, _, y) in enumerate(vectors)}
@@ -137,8 +134,8 @@ class CompiledRollout:
             input_size=encoder.input_size,
             num_particles=first.kernel_out.shape[1],
             num_layers=len(layers),
-            num_inducing=_rounded_up(first.kernel_out.shape[-1], units),
-            num_features=_rounded_up(first.feature_out.shape[-1], units),
+            num_inducing=first.kernel_out.shape[-1],
+            num_features=first.feature_out.shape[-1],
             num_functions=first.kernel_out.shape[0],
             input_kind=self._integers([kind for kind, _ in inputs]),
             input_source=self._integers([source for _, source in inputs]),
@@ -186,19 +183,18 @@ class CompiledRollout:
             if blur is not None:
                 moved.append((blur.centre - origin).float().contiguous())
                 task.centre = _pointer(moved[-1])
-        start = begins.to(torch.float32).contiguous()
-        actions = actions.to(torch.float32).contiguous()
-        states = actions.new_empty(horizon + 1, task.num_particles, num_candidates, task.observation_size)
+        start, points = begins.to(torch.float32).contiguous(), int(self._library.points())
+        by_step = pad(actions.to(torch.float32).permute(1, 2, 0), (0, -num_candidates % points)).contiguous()
+        states = start.new_empty(horizon + 1, task.num_particles, num_candidates, task.observation_size)
         task.num_candidates, task.horizon = num_candidates, horizon
-        task.start, task.actions, task.states = (_pointer(tensor) for tensor in (start, actions, states))
+        task.start, task.actions, task.states = (_pointer(tensor) for tensor in (start, by_step, states))
 
         def run(first: int, last: int) -> int:
             calls = (self._library.rollout(task, particle, first, last) for particle in range(task.num_particles))
             return sum(calls)
 
         # Shares of whole blocks: a block that is half full costs as much as a full one.
-        threads, points = torch.get_num_threads(), int(self._library.points())
-        share = _rounded_up(-(-num_candidates // threads), points)
+        share = -(-num_candidates // torch.get_num_threads() // points) * points
         ranges = [(first, min(first + share, num_candidates)) for first in range(0, num_candidates, share)]
         if compiler.in_threads(run, ranges):
             raise MemoryError("could not allocate the scratch space of a rollout, a few kilobytes for each thread")
@@ -236,24 +232,14 @@ class CompiledRollout:
                 f"{actions.shape[1]}"
             )
 
-    def _packed(self, layer: PathwiseLayer, units: int) -> _Layer:
-        """A layer in the layout of the compiled code, M and F padded to whole blocks of functions that are zero."""
-        number, padded = _kernel_number(layer.kernel), _padded(layer, units)
+    def _described(self, layer: PathwiseLayer) -> _Layer:
+        """A layer as the compiled code is told of it."""
+        kernel, *weights = layer
+        number = _kernel_number(kernel)
         if number is None:
-            raise RuntimeError(f"the compiled code has no kernel {layer.kernel.name!r}: check is_available first")
-        return _Layer(
-            number,
-            layer.kernel.argument_scale,
-            padded.kernel_out.shape[2],
-            self._floats(padded.inverse_lengthscale),
-            self._floats(_blocks(padded.centres, units)),
-            self._floats(padded.offsets),
-            self._floats(_blocks(padded.frequencies, units)),
-            self._floats(padded.phases),
-            self._floats(padded.kernel_out),
-            self._floats(padded.feature_out),
-            None if padded.linear_out is None else self._floats(padded.linear_out),
-        )
+            raise RuntimeError(f"the compiled code has no kernel {kernel.name!r}: check is_available first")
+        pointers = (None if weight is None else self._floats(weight) for weight in weights)
+        return _Layer(number, kernel.argument_scale, layer.kernel_out.shape[2], *pointers)
 
     def _floats(self, values: Tensor) -> "ctypes._Pointer[ctypes.c_float]":
         self._kept_alive.append(values.to(torch.float32).contiguous())
@@ -266,11 +252,11 @@ class CompiledRollout:
 
 @cache
 def _library() -> ctypes.CDLL | None:
-    library = compiler.load(SOURCE)
+    library = compiler.load(SOURCE, "-ffp-contract=off")
     if library is not None:
         library.rollout.argtypes = (ctypes.POINTER(_Task), *(ctypes.c_int64,) * 3)
         library.kernel_number.argtypes = (ctypes.c_char_p,)
-        for function in (library.rollout, library.units, library.points, library.kernel_number):
+        for function in (library.rollout, library.points, library.kernel_number):
             function.restype = ctypes.c_int64
     return library
 
@@ -284,28 +270,3 @@ def _kernel_number(kernel: Kernel) -> int | None:
 
 def _pointer(tensor: Tensor) -> "ctypes._Pointer[ctypes.c_float]":
     return ctypes.cast(tensor.data_ptr(), _Floats)
-
-
-def _rounded_up(size: int, unit: int) -> int:
-    return -(-size // unit) * unit
-
-
-def _padded(layer: PathwiseLayer, units: int) -> PathwiseLayer:
-    pad_inducing, pad_features = (-tensor.shape[-1] % units for tensor in (layer.kernel_out, layer.feature_out))
-    if not pad_inducing and not pad_features:
-        return layer
-    padding = {
-        "centres": pad_inducing,
-        "offsets": pad_inducing,
-        "kernel_out": pad_inducing,
-        "frequencies": pad_features,
-        "phases": pad_features,
-        "feature_out": pad_features,
-    }
-    padded: dict[str, Any] = {name: pad(getattr(layer, name), (0, size)) for name, size in padding.items()}
-    return layer._replace(**padded)
-
-
-def _blocks(weights: Float[Tensor, "P D n"], units: int) -> Float[Tensor, "P blocks D units"]:
-    """Columns grouped as the compiled code reads them."""
-    return weights.unflatten(2, (-1, units)).movedim(2, 1)

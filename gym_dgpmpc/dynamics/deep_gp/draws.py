@@ -103,9 +103,10 @@ def _draw_layer(
 
     f(x) = phi(x) . w + k(x, Z) alpha with alpha = L_z^-T (v - L_z^-1 (phi(Z) w + sqrt(jitter) e)), w, e ~ N(0, I)
     (Wilson et al. 2020, eq. 13). The features of a linear part are x times its slopes' standard deviations, exactly.
-    The term e makes the law exact for the jittered K_zz. Every particle has features of
-    its own, so that over the particles of one plan the law is right, and not only over plans; its functions share them,
-    so all their alpha are one product of their normals (w, e) with K_zz^-1 (phi(Z), sqrt(jitter) I).
+    The term e makes the law exact for the jittered K_zz. Every particle has features of its own, so that over the
+    particles of one plan the law is right, and not only over plans; its functions share them, so all alpha of many
+    functions are one product of their normals (w, e) with K_zz^-1 (phi(Z), sqrt(jitter) I); for few, two solves with a
+    column for each output cost less.
     """
     num_particles, num_inducing, outputs = whitened.shape
     lengthscale = layer.lengthscale.unsqueeze(-2)
@@ -121,14 +122,16 @@ def _draw_layer(
     normals = torch.randn(shape, generator=generator, dtype=torch.float32, device=scaled.device)
     variance = layer.variance[:, None, None]
     sigma = variance.sqrt()
-    jitter = (JITTER**0.5 * torch.eye(num_inducing, dtype=torch.float32, device=scaled.device)).to(scaled)
-    prior = sigma * torch.cat([values, jitter.expand(num_particles, -1, -1)], dim=2)
-    known = torch.linalg.solve_triangular(factor.mT, whitened, upper=True)
-    if columns < prior.shape[-1]:
-        response = torch.cholesky_solve(prior @ normals.to(scaled.dtype), factor)
+    drawn, rest = normals.to(scaled.dtype), whitened.repeat(1, 1, num_functions)
+    if columns < normals.shape[1]:
+        prior = sigma * torch.baddbmm(drawn[:, -num_inducing:], values, drawn[:, :-num_inducing], beta=JITTER**0.5)
+        rest -= torch.linalg.solve_triangular(factor, prior, upper=False)
+        alpha = torch.linalg.solve_triangular(factor.mT, rest, upper=True)
     else:
-        response = torch.cholesky_solve(prior, factor) @ normals.to(scaled.dtype)
-    alpha = known.repeat(1, 1, num_functions) - response
+        eye = torch.eye(num_inducing, dtype=values.dtype, device=values.device).expand(num_particles, -1, -1)
+        shared = torch.cholesky_solve(sigma * torch.cat([values, JITTER**0.5 * eye], dim=2), factor)
+        known = torch.linalg.solve_triangular(factor.mT, whitened, upper=True)
+        alpha = known.repeat(1, 1, num_functions) - shared @ drawn
 
     def per_function(matrix: Float[Tensor, "P n columns"]) -> Float[Tensor, "T P O n"]:
         return matrix.to(dtype).mT.unflatten(1, (num_functions, outputs)).transpose(0, 1).contiguous()
@@ -136,7 +139,7 @@ def _draw_layer(
     linear_out = None
     if root is not None:
         along = root.square().unsqueeze(-1) * (scaled.mT @ alpha)
-        own = root.unsqueeze(-1) * normals[:, num_features:-num_inducing].to(scaled.dtype)
+        own = root.unsqueeze(-1) * drawn[:, num_features:-num_inducing]
         linear_out = per_function(variance * along + sigma * own)
     scale = layer.kernel.argument_scale
     return PathwiseLayer(
@@ -145,7 +148,6 @@ def _draw_layer(
         (-2.0 * scale * scaled.mT).to(dtype).contiguous(),
         (scale * scaled.square().sum(-1)).to(dtype),
         (features.frequency.mT / (2 * math.pi)).to(dtype).contiguous(),
-        (features.phase / (2 * math.pi)).to(dtype).expand(num_particles, -1).contiguous(),
         per_function(variance * alpha),
         per_function(sigma * (2.0 / num_features) ** 0.5 * normals[:, :num_features]),
         linear_out,
@@ -211,23 +213,20 @@ class PathwiseSampler:
 
     @cached_property
     def _in_weights(self) -> list[tuple[Tensor, Tensor]]:
-        """Each layer's maps from (x, |x|^2, 1) to the kernel's argument "P D+2 M" and features' phases "P D+2 F"."""
+        """Each layer's maps from (x, |x|^2, 1) to the kernel's argument "P D+2 M", and from x to angles "P D F/2"."""
         weights = []
         for layer in self.layers:
             square = torch.full_like(layer.offsets, layer.kernel.argument_scale)
             distance = torch.cat([layer.centres, torch.stack([square, layer.offsets], dim=1)], dim=1)
-            turns = torch.cat(
-                [layer.frequencies, torch.stack([torch.zeros_like(layer.phases), layer.phases], dim=1)], dim=1
-            )
-            weights.append((distance, 2 * math.pi * turns))
+            weights.append((distance, 2 * math.pi * layer.frequencies))
         return weights
 
     def _evaluate(
         self, layer: PathwiseLayer, weights: tuple[Tensor, Tensor], x: Tensor, function: int, buffers: "_Buffers"
     ) -> Tensor:
         """f(x) - m(x) "P K O" of every particle's function."""
-        augmented, correlations, decay, waves = buffers
-        size, group = x.shape[-1], correlations.shape[0]
+        augmented, correlations, decay, angles, waves = buffers
+        size, group, half = x.shape[-1], correlations.shape[0], angles.shape[-1]
         scaled = augmented[..., :size]
         torch.mul(x, layer.inverse_lengthscale.unsqueeze(1), out=scaled)
         torch.linalg.vecdot(scaled, scaled, out=augmented[..., size])
@@ -236,9 +235,11 @@ class PathwiseSampler:
         for first in range(0, len(x), group):
             own = slice(first, first + group)
             torch.bmm(augmented[own], weights[0][own], out=correlations)
-            torch.bmm(augmented[own], weights[1][own], out=waves)
+            torch.bmm(scaled[own], weights[1][own], out=angles)
             layer.kernel.correlation_(correlations, decay)
-            torch.bmm(waves.cos_(), feature_out[own], out=out[own])
+            torch.cos(angles, out=waves[..., :half])
+            torch.sin(angles, out=waves[..., half:])
+            torch.bmm(waves, feature_out[own], out=out[own])
             out[own].baddbmm_(correlations, kernel_out[own])
         if layer.linear_out is not None:
             out.baddbmm_(scaled, layer.linear_out[function].mT)
@@ -289,6 +290,7 @@ class _Buffers(NamedTuple):
     augmented: Float[Tensor, "P K D+2"]  # (x, |x|^2, 1)
     correlations: Float[Tensor, "G K M"]
     decay: Float[Tensor, "G K M"]
+    angles: Float[Tensor, "G K half_F"]
     waves: Float[Tensor, "G K F"]
 
     @classmethod
@@ -296,10 +298,11 @@ class _Buffers(NamedTuple):
         """Room for G particles at a time: one on a CPU, so that its values stay in the cache; all on a GPU."""
         num_particles, num_points, size = x.shape
         group = 1 if x.device.type == "cpu" else num_particles
-        num_inducing, num_features = layer.offsets.shape[1], layer.phases.shape[1]
+        num_inducing, half = layer.offsets.shape[1], layer.frequencies.shape[-1]
         return cls(
             x.new_ones(num_particles, num_points, size + 2),
             x.new_empty(group, num_points, num_inducing),
             x.new_empty(group, num_points, num_inducing),
-            x.new_empty(group, num_points, num_features),
+            x.new_empty(group, num_points, half),
+            x.new_empty(group, num_points, 2 * half),
         )
