@@ -88,8 +88,8 @@ def test_an_unknown_setting_is_named_with_what_may_have_been_meant():
             {
                 "num_layers": 2, "num_inducing": 100, "refresh": "plan", "num_features": 64,
                 "first_training_iterations": 1000, "training_iterations": 300, "num_chains": 5, "num_samples": 100,
-                "sample_spacing": 5, "resample_samples": 5, "relocate": True, "add_noise": True, "split_noise": True,
-                "compile": True, "step_size": 0.02, "decay": 0.05, "hyperparameters": "optimised",
+                "sample_spacing": 20, "resample_samples": 5, "relocate": True, "add_noise": True, "split_noise": True,
+                "compile": True, "step_size": 0.1, "decay": 0.05, "hyperparameters": "optimised",
                 "hyperparameter_step_size": 0.02, "learning_rate": 0.1, "hyperparameters_every": 1, "window_size": 1,
                 "batch_size": 256, "gibbs_every": 20, "gibbs_rows": 4096, "patience": None, "look_every": 100,
             },

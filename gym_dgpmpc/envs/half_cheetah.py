@@ -216,16 +216,18 @@ class VelocityHalfCheetahEnv(MujocoTask, utils.EzPickle):
         return {"x_position": float(self.data.qpos[0])}
 
 
-def make_risk_sensitive_half_cheetah(penalise_step: bool = False, **kwargs: Any) -> gym.Env:
+def make_risk_sensitive_half_cheetah(penalise_step: bool = False, wrap: bool = False, **kwargs: Any) -> gym.Env:
     """`RiskSensitiveHalfCheetah-v0`: `VelocityHalfCheetahEnv` under `RiskSensitiveReward`, as in the paper.
 
     Plans use the reward less floor(|pitch| / 20 degrees); by default, `step` reports the reward without the penalty.
 
     Args:
         penalise_step: let `step` return the penalised reward too, for agents without a model.
+        wrap: count the pitch from the nearest full turn; see `RiskSensitiveReward`.
         kwargs: of `VelocityHalfCheetahEnv`.
     """
-    return RiskSensitiveReward(VelocityHalfCheetahEnv(**kwargs), angle_index=PITCH, penalise_step=penalise_step)
+    env = VelocityHalfCheetahEnv(**kwargs)
+    return RiskSensitiveReward(env, angle_index=PITCH, penalise_step=penalise_step, wrap=wrap)
 
 
 # As on a class: `gymnasium.make` reads here which other modes it can derive, such as "rgb_array_list".

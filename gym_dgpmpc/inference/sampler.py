@@ -38,7 +38,7 @@ from gym_dgpmpc.randomness import quick_normals
 LAST_LEARNING_RATE = 1 / 6
 """Adam's learning rate at the end of its iterations, as a share of that at their start; it falls geometrically."""
 
-MOST_TURNED, MOST_HEATED = 0.25, 0.1
+MOST_TURNED, MOST_HEATED = 0.03, 0.1
 """See `step_sizes`: of the squared angle that a step turns, and of the variance that minibatches add."""
 
 

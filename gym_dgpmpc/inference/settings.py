@@ -18,8 +18,8 @@ class InferenceSettings:
     """Settings of the sampler; `DeepGPDynamics` takes them as keyword arguments.
 
     Attributes:
-        step_size: step size of SG-HMC for inducing outputs, epsilon; twice the value of Havasi et al., see
-            docs/deviations.md.
+        step_size: step size of SG-HMC for inducing outputs, epsilon, wherever that is short enough (see
+            `sampler.step_sizes`); ten times the value of Havasi et al., see docs/deviations.md.
         decay: friction of SG-HMC, m, in [0, 1].
         hyperparameters: "optimised", as in the paper: one value for each chain, without a prior; or "sampled" with the
             inducing outputs, under wide priors, after a burn-in that optimises them.
@@ -40,7 +40,7 @@ class InferenceSettings:
         ValueError: a setting is out of its range.
     """
 
-    step_size: float = 0.02
+    step_size: float = 0.1
     decay: float = 0.05
     hyperparameters: Hyperparameters = "optimised"
     hyperparameter_step_size: float = 0.02

@@ -25,17 +25,22 @@ class AnglePenalty:
     """One for each full ``angle_step`` by which an angle differs from 0: floor(|angle| / angle_step).
 
     Attributes:
-        angle_index: which number of the observation is the angle, in rad. It is taken as it is: where it counts full
-            turns, so does the penalty.
+        angle_index: which number of the observation is the angle, in rad.
         angle_step: in rad.
+        wrap: take the angle to within half a turn of 0 first. Without it, where the angle counts full turns so does the
+            penalty.
     """
 
     angle_index: int
     angle_step: float
+    wrap: bool = False
 
     def __call__(self, next_observation: Float[Tensor, "*b S"]) -> Float[Tensor, "*b"]:
         """The penalty of each state, in the precision of ``next_observation``."""
-        return (next_observation[..., self.angle_index].abs() / self.angle_step).floor()
+        angle = next_observation[..., self.angle_index]
+        if self.wrap:
+            angle = (angle + math.pi).remainder(2.0 * math.pi) - math.pi
+        return (angle.abs() / self.angle_step).floor()
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,8 @@ class RiskSensitiveReward(gym.Wrapper, RecordConstructorArgs):
         angle_index: which number of the observation is the angle, in rad.
         angle_step: the angle that costs one unit, in rad; 20 degrees as in the paper.
         penalise_step: return the penalised reward from `step` too.
+        wrap: count the angle from the nearest full turn. The paper does not: who has turned over once then pays 18 a
+            step for ever, at 20 degrees, standing upright or not.
 
     Raises:
         ValueError: the environment's reward is not known as a function of the actions that it is given, or an argument
@@ -78,10 +85,15 @@ class RiskSensitiveReward(gym.Wrapper, RecordConstructorArgs):
     keeps_observations = True  # for `known.may_change_observations`
 
     def __init__(
-        self, env: gym.Env, angle_index: int, angle_step: float = math.pi / 9, penalise_step: bool = False
+        self,
+        env: gym.Env,
+        angle_index: int,
+        angle_step: float = math.pi / 9,
+        penalise_step: bool = False,
+        wrap: bool = False,
     ) -> None:
         RecordConstructorArgs.__init__(
-            self, angle_index=angle_index, angle_step=angle_step, penalise_step=penalise_step
+            self, angle_index=angle_index, angle_step=angle_step, penalise_step=penalise_step, wrap=wrap
         )
         gym.Wrapper.__init__(self, env)
         space = env.observation_space
@@ -95,7 +107,7 @@ class RiskSensitiveReward(gym.Wrapper, RecordConstructorArgs):
             raise ValueError(f"angle_index must be from 0 to {space.shape[0] - 1}; got {angle_index}")
         if not (math.isfinite(angle_step) and angle_step > 0):
             raise ValueError(f"angle_step must be a positive number, in rad; got {angle_step!r}")
-        self._penalty, self._penalise_step = AnglePenalty(angle_index, float(angle_step)), penalise_step
+        self._penalty, self._penalise_step = AnglePenalty(angle_index, float(angle_step), wrap), penalise_step
         self.reward_fn: RewardFn = PenalisedReward(_reward_of(env), self._penalty)
         """The penalised reward, batched."""
         self.plans_with_another_reward = not penalise_step

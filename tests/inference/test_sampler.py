@@ -212,7 +212,7 @@ def test_the_prior_weighs_less_the_more_data_there_are(seen_gradients):
 
 @pytest.mark.parametrize(
     ("batch_size", "bound"),
-    [(200, 0.25), (1000, 0.25), (198, 0.25), (100, 2 * 0.05 * 0.1 / 0.5), (8, 2 * 0.05 * 0.1 / 0.96)],
+    [(200, 0.03), (1000, 0.03), (198, 0.03), (100, 2 * 0.05 * 0.1 / 0.5), (8, 2 * 0.05 * 0.1 / 0.96)],
 )
 def test_a_step_turns_no_coordinate_far_and_minibatches_heat_none_much(batch_size, bound):
     """Each coordinate has a step of its own, as long as asked for wherever that is short enough."""

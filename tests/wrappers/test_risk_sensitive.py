@@ -62,6 +62,21 @@ def test_penalty_by_hand():
     assert torch.isnan(reward_fn(after, torch.zeros(7, 6), after.fill_(torch.nan))).all()  # stays a failure to be seen
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_wrapped_it_counts_from_the_nearest_full_turn(dtype):
+    env = gymnasium.make("RiskSensitiveHalfCheetah-v0", ctrl_cost_weight=0.0, wrap=True)
+    after = torch.zeros(8, 18, dtype=dtype)
+    degrees = torch.tensor([19.9, -20.1, 179.0, 181.0, 339.0, 361.0, -720.1, 750.0], dtype=dtype)
+    after[:, 2] = torch.deg2rad(degrees)
+    reward = env.get_wrapper_attr("reward_fn")(after, torch.zeros(8, 6), after)
+    assert reward.tolist() == [0.0, -1.0, -8.0, -8.0, -1.0, 0.0, 0.0, -1.0]
+    env.reset(seed=0)
+    env.unwrapped.set_state(np.eye(9)[2] * 2 * np.pi, np.zeros(9))
+    *_, info = env.step(np.zeros(6, np.float32))
+    assert info["reward_risk_sensitive"] == info["reward_original"]
+    assert torch.isnan(env.get_wrapper_attr("reward_fn")(after, torch.zeros(8, 6), after.fill_(torch.nan))).all()
+
+
 def test_the_rest_is_as_it_was():
     plain, wrapped = gymnasium.make("VelocityHalfCheetah-v0"), gymnasium.make("RiskSensitiveHalfCheetah-v0")
     actions = uniform_actions(plain.action_space, 30, seed=0)

@@ -135,7 +135,7 @@ class DeepGPDynamics(Learner[Fitted]):
         training_iterations: int = 300,
         num_chains: int = 5,
         num_samples: int = 100,
-        sample_spacing: int = 5,
+        sample_spacing: int = 20,
         resample_samples: int = 5,
         relocate: bool = True,
         add_noise: bool = True,
