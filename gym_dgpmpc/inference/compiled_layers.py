@@ -232,10 +232,14 @@ def factorise(covariance: Float[Tensor, "*b M M"], added: float) -> tuple[Float[
     return upper[:, :size, :size].unflatten(0, covariance.shape[:-2]).mT, not failed
 
 
+_LONG = frozenset(("see", "back", "gram"))
+"""Functions that are worth threads; the others are done sooner than these are woken."""
+
+
 def _in_shares(count: int, name: str, *arguments: object) -> int:
-    """Call a function for so many chains, or matrices, each thread for a share of them; the sum of what it returns."""
+    """Call a function for so many chains, or matrices, in threads if it is long; the sum of what it returns."""
     function: Callable[..., int] = getattr(_library(), name)
-    share = -(-count // torch.get_num_threads())
+    share = -(-count // torch.get_num_threads()) if name in _LONG else count
     ranges = [(first, min(first + share, count)) for first in range(0, count, share)]
     return compiler.in_threads(lambda first, last: function(*arguments, first, last), ranges)
 
