@@ -131,7 +131,7 @@ def test_gibbs_step_moves_the_last_layer_alone(num_chains, generator):
     assert all(torch.equal(a, b) for a, b in zip(after.parameters, before.parameters, strict=True))
 
 
-@pytest.mark.parametrize(("batch_size", "step_size"), [(10, 0.05), (N, 0.3)])
+@pytest.mark.parametrize(("batch_size", "step_size"), [(10, 0.05), (N, 0.1)])
 def test_a_gibbs_step_draws_the_momentum_of_the_last_layer_from_its_own_law(batch_size, step_size, generator):
     """N(0, eps^2 M^-1 / N), where SG-HMC leaves it, with the mass and the step size of each coordinate."""
     model, data, num_draws = chains(*(deep_gp(2, generator) for _ in range(2))), toy(generator), 400
