@@ -193,7 +193,7 @@ class CompiledRollout:
             calls = (self._library.rollout(task, particle, first, last) for particle in range(task.num_particles))
             return sum(calls)
 
-        # Shares of whole blocks: a block that is half full costs as much as a full one.
+        # Shares of whole vectors: one that is half full costs as much as a full one.
         share = -(-num_candidates // torch.get_num_threads() // points) * points
         ranges = [(first, min(first + share, num_candidates)) for first in range(0, num_candidates, share)]
         if compiler.in_threads(run, ranges):

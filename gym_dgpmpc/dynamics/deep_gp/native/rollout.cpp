@@ -9,9 +9,10 @@
 //
 // with argument_m = offset_m + c |x|^2 + centre_m . x and turns_i = frequency_i . x. Blocks of up to VECTORS LANES points
 // and UNITS inducing inputs (or WAVES frequencies) stay in registers from the first product over the kernel to the second
-// product: nothing of the size "points x inducing inputs" is ever written to memory. What counts is the number of
-// multiplications, for which a processor has few units: hence powers of two instead of exp, a table instead of a longer
-// polynomial, and every frequency's cosine and sine together.
+// product: nothing of the size "points x inducing inputs" is ever written to memory. The products take the processor's
+// multipliers all the time that they last, and more than half of the whole. So the kernels have as few multiplications
+// as may be, hence powers of two instead of exp and a table instead of a longer polynomial; every frequency has its cosine
+// and its sine at once; and a block at the end is only as wide as it must be.
 //
 // Built on the user's machine with its own vector width (GCC or Clang; see `compiler.py`). NaN goes through.
 
@@ -135,7 +136,9 @@ struct MinusRoot {
   vec x, y;
   explicit inline MinusRoot(vec x) : x(x), y((vec)_mm512_rsqrt14_ps((__m512)x)) {}
 };
-inline vec plus(const MinusRoot &root, vec c) { return (vec)_mm512_fnmadd_ps((__m512)root.x, (__m512)root.y, (__m512)c); }
+inline vec plus(const MinusRoot &root, vec c) {
+  return (vec)_mm512_fnmadd_ps((__m512)root.x, (__m512)root.y, (__m512)c);
+}
 #else
 inline vec root(vec x) {
 #if defined(__AVX2__)
@@ -156,10 +159,11 @@ inline vec plus(vec x, vec c) { return x + c; }
 constexpr double LOG2 = 0.69314718055994530942;
 constexpr float FARTHEST = 86.56f;  // exp(-60) = 2^-86.56: what is smaller might become subnormal, and slow
 
-// scale 2^x for -FARTHEST <= x <= 0, to 2e-7 of itself.
+// scale 2^x for -FARTHEST <= x <= 0, to 3e-7 of itself.
 #if defined(__AVX512F__)
 // x = n + j / 32 + r: a table's 2^(j / 32), a quadratic for 2^r (the best relative one, error 5e-8; as a square, which
-// saves a multiplication), and n added to the exponent's bits.
+// saves a multiplication), and n added to the exponent's bits. Four roundings of at most 6e-8 add to the error: of what
+// is squared, of the sum, of the table and of the product.
 struct Power {
   // The table, times the quadratic's leading coefficient, less what a shift of the index adds to the mantissa.
   alignas(64) int32_t table[32] = {};
@@ -183,7 +187,8 @@ struct Power {
   }
 };
 #else
-// x = n + r, a polynomial for 2^r (the best relative one, error 7e-8), and n added to the exponent's bits.
+// x = n + r, a polynomial for 2^r (the best relative one, error 7e-8, and as much from its last sums), and n added to the
+// exponent's bits.
 struct Power {
   float scale;
   constexpr explicit Power(double scale) : scale((float)scale) {}
@@ -200,32 +205,9 @@ struct Power {
 };
 #endif
 
-// cos(2 pi r) and sin(2 pi r) for |r| <= 1/2 to 2e-7: polynomials in r^2 whose coefficients interpolate at Chebyshev nodes
-// (errors 1e-8 and 2e-9).
-inline vec cosine_of_reduced(vec r) {
-  vec u = r * r;
-  vec p = fused(u, 6.5286581576f, -25.967599246f);
-  p = fused(p, u, 60.167630950f);
-  p = fused(p, u, -85.450139531f);
-  p = fused(p, u, 64.939117460f);
-  p = fused(p, u, -19.739204499f);
-  return fused(p, u, 0.99999998906f);
-}
-
-inline vec sine_of_reduced(vec r) {
-  vec u = r * r;
-  vec p = fused(u, 3.2381374985f, -14.899846659f);
-  p = fused(p, u, 42.025926983f);
-  p = fused(p, u, -76.703015353f);
-  p = fused(p, u, 81.605131386f);
-  p = fused(p, u, -41.341700405f);
-  p = fused(p, u, 6.2831853025f);
-  return p * r;
-}
-
-// cos(pi x) and sin(pi x) to 2e-7: x = n + r with |r| <= 1/2, the best polynomials in r^2 (errors 5e-8 and 3e-9), and the
-// sign of (-1)^n. In place: x becomes the cosine.
-inline void cosine_and_sine(vec &x, vec &sine) {
+// cos(pi x) and sin(pi x) to 3e-7: x = n + r with |r| <= 1/2, the best polynomials in r^2 (errors 5e-8 and 3e-9; what they
+// add up is at most 1.6, and rounded thrice), and the sign of (-1)^n.
+inline void wave(vec x, vec &cosine, vec &sine) {
   const vec n = nearest(x), r = x - n, u = r * r;
   const ivec sign = __builtin_convertvector(n, ivec) << 31;
   vec c = fused(u, 0.21969679861f, -1.33188016125f);
@@ -236,20 +218,20 @@ inline void cosine_and_sine(vec &x, vec &sine) {
   s = fused(s, u, -5.16770687910f);
   c = fused(c, u, 0.99999995347f);
   s = fused(s, u, 3.14159258005f);
-  x = (vec)((ivec)c ^ sign);
+  cosine = (vec)((ivec)c ^ sign);
   sine = (vec)((ivec)(s * r) ^ sign);
 }
 
-// An angle in radians as a part of a turn in [-1/2, 1/2], with 2 pi in two parts so that large angles keep their digits.
-inline vec reduced(vec angle) {
-  vec n = nearest(angle * 0.159154943f);
-  vec r = fused(n, -6.28125f, angle);
-  return fused(n, -1.9353072e-3f, r) * 0.159154943f;
+// Of an angle in radians, less its whole turns: 2 pi in two parts, so that large angles keep their digits.
+inline void direction(vec angle, vec &cosine, vec &sine) {
+  const vec n = nearest(angle * 0.159154943f);
+  const vec r = fused(n, -1.9353072e-3f, fused(n, -6.28125f, angle));
+  wave(r * 0.318309886f, cosine, sine);
 }
 
-// Kernels with unit variance, by the names of gp/kernels.py, which has their formulas; `correlation_` there says what the
-// range is for. The argument is unit c r^2, with the unit such that exponents are those of two. A new one is a struct
-// here and its place in KERNEL_TYPES.
+// Kernels with unit variance to 4e-7, by the names of gp/kernels.py, which has their formulas; `correlation_` there says
+// what the range is for. The argument is unit c r^2, with the unit such that exponents are those of two. A new one is a
+// struct here and its place in KERNEL_TYPES.
 constexpr Power power_of_two(1.0);
 
 struct RBF {
@@ -279,7 +261,7 @@ struct Matern32 {
   static constexpr const char *name = "matern32";
   static constexpr double unit = MATERN_UNIT;
   static inline vec correlation(vec argument) {
-    constexpr Power power(LOG2 * LOG2 / 2.0);
+    static constexpr Power power(LOG2 * LOG2 / 2.0);
     constexpr float h = 1.0 / LOG2;
     const vec a = square(argument);
     const MinusRoot q(a);
@@ -373,7 +355,7 @@ void evaluate(const Functions &of, int64_t inputs, const vec *x, vec *out) {
 #pragma GCC unroll 4
     for (int j = 0; j < WAVES; j++)
 #pragma GCC unroll 4
-      for (int v = 0; v < V; v++) cosine_and_sine(cosines[j][v], sines[j][v]);
+      for (int v = 0; v < V; v++) wave(cosines[j][v], cosines[j][v], sines[j][v]);
     for (int64_t o = 0; o < of.outputs; o++, weights += 2 * WAVES)
 #pragma GCC unroll 4
       for (int v = 0; v < V; v++) {
@@ -443,8 +425,8 @@ void pack(const Task &task, const Layer &layer, int64_t particle, int64_t functi
 // The part of a vector (heading, x, y) forwards, or to the left, of the body.
 template <int V>
 inline vec along_body(const int64_t *vector, const vec *state, int v, bool forwards) {
-  const vec turn = reduced(state[vector[0] * V + v]);
-  const vec cosine = cosine_of_reduced(turn), sine = sine_of_reduced(turn);
+  vec cosine, sine;
+  direction(state[vector[0] * V + v], cosine, sine);
   const vec x = state[vector[1] * V + v], y = state[vector[2] * V + v];
   return forwards ? cosine * x + sine * y : cosine * y - sine * x;
 }
@@ -460,8 +442,11 @@ void encode(const Task &task, const vec *state, const float *actions, int64_t st
         memcpy(&raw, actions + source * stride + v * LANES, sizeof raw);
       } else {
         raw = kind > 3 ? along_body<V>(task.vectors + 3 * source, state, v, kind == 4) : state[source * V + v];
-        if (kind == 1) raw = sine_of_reduced(reduced(raw));
-        if (kind == 2) raw = cosine_of_reduced(reduced(raw));
+        vec cosine, sine;
+        if (kind == 1 || kind == 2) {
+          direction(raw, cosine, sine);
+          raw = kind == 1 ? sine : cosine;
+        }
       }
       input[d * V + v] = (raw - task.input_mean[d]) * task.input_scale[d];
     }
@@ -482,8 +467,8 @@ void decode(const Task &task, const vec *out, vec *state, vec *moved) {
   for (int64_t k = 0; k < task.num_vectors; k++) {
     const int64_t *vector = task.vectors + 3 * k;
     for (int v = 0; v < V; v++) {
-      const vec turn = reduced(state[vector[0] * V + v]);
-      const vec cosine = cosine_of_reduced(turn), sine = sine_of_reduced(turn);
+      vec cosine, sine;
+      direction(state[vector[0] * V + v], cosine, sine);
       const vec forwards = with_added<V>(task, out, vector[1], v, vec{});
       const vec left = with_added<V>(task, out, vector[2], v, vec{});
       const vec x = state[vector[1] * V + v] * task.carried[vector[1]];
