@@ -5,10 +5,8 @@ from functools import partial
 
 import torch
 
-from benchmarks.speed.cases import NUM_CANDIDATES, NUM_INDUCING, NUM_PARTICLES, Case, seeded
+from benchmarks.speed.cases import NUM_CANDIDATES, NUM_FEATURES, NUM_INDUCING, NUM_PARTICLES, Case, seeded
 from gym_dgpmpc.data.encoding import Encoder
-
-NUM_FEATURES = 128
 
 
 def outputs(case: Case, num_layers: int) -> list[int]:
@@ -20,17 +18,19 @@ def outputs(case: Case, num_layers: int) -> list[int]:
 def rollout_flops(case: Case, num_layers: int) -> float:
     """Multiplications and additions of the two products of all layers in one rollout step of P K points."""
     size = Encoder(case.observation_size, case.action_size, case.spec).input_size
-    points, columns = NUM_PARTICLES * NUM_CANDIDATES, NUM_INDUCING + NUM_FEATURES
-    return sum(2.0 * points * columns * (size + out) for out in outputs(case, num_layers))
+    points, frequencies = NUM_PARTICLES * NUM_CANDIDATES, NUM_FEATURES // 2
+    columns_in, columns_out = NUM_INDUCING + frequencies, NUM_INDUCING + NUM_FEATURES
+    return sum(2.0 * points * (size * columns_in + out * columns_out) for out in outputs(case, num_layers))
 
 
 def bare_step(case: Case, num_layers: int) -> Callable[[], None]:
-    """Products, square roots, exponentials and cosines of one rollout step, into buffers, a particle at a time."""
+    """Products, square roots, exponentials, cosines and sines of one rollout step, into buffers, particle by particle."""
     size = Encoder(case.observation_size, case.action_size, case.spec).input_size
     random = partial(torch.randn, generator=seeded(0))
     points = random(NUM_CANDIDATES, size + 2)
-    near, far = random(size + 2, NUM_INDUCING), random(size + 2, NUM_FEATURES)
-    distances, waves = torch.empty(NUM_CANDIDATES, NUM_INDUCING), torch.empty(NUM_CANDIDATES, NUM_FEATURES)
+    near, far = random(size + 2, NUM_INDUCING), random(size, NUM_FEATURES // 2)
+    distances, angles = torch.empty(NUM_CANDIDATES, NUM_INDUCING), torch.empty(NUM_CANDIDATES, NUM_FEATURES // 2)
+    waves = torch.empty(NUM_CANDIDATES, NUM_FEATURES)
     positive = torch.rand(NUM_CANDIDATES, NUM_INDUCING, generator=seeded(1)) + 0.5
     last = [
         (random(NUM_INDUCING, out), random(NUM_FEATURES, out), torch.empty(NUM_CANDIDATES, out))
@@ -43,8 +43,9 @@ def bare_step(case: Case, num_layers: int) -> Callable[[], None]:
                 torch.mm(points, near, out=distances)
                 torch.sqrt(positive, out=distances)
                 torch.exp(positive, out=distances)
-                torch.mm(points, far, out=waves)
-                torch.cos(waves, out=waves)
+                torch.mm(points[:, :size], far, out=angles)
+                torch.cos(angles, out=waves[:, : NUM_FEATURES // 2])
+                torch.sin(angles, out=waves[:, NUM_FEATURES // 2 :])
                 torch.mm(distances, kernel_out, out=out)
                 torch.mm(waves, feature_out, out=out)
 

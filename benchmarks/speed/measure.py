@@ -128,6 +128,8 @@ def parts(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
     yield (
         row | {"how": "CEM itself"} | timed(partial(cem.plan, lambda _: scores, cem.initial_plan(), generator), repeats)
     )
+    follow = partial(model.resample, data, generator)
+    yield {"what": "beside a plan", "how": "following the last transitions"} | timed(follow, repeats)
 
 
 def inductor(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:

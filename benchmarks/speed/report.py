@@ -4,10 +4,11 @@ from typing import Any
 
 from benchmarks.report import markdown
 from benchmarks.rows import Row, find
+from benchmarks.speed.cases import NUM_CANDIDATES, NUM_FEATURES, NUM_INDUCING, NUM_PARTICLES
 
 EXTRA = (
-    "chains", "varied", "value", "extra_memory_mb", "seconds_to_compile", "product_gflops", "large_product_gflops",
-    "by",
+    "cpu_ms", "chains", "varied", "value", "extra_memory_mb", "seconds_to_compile", "product_gflops",
+    "large_product_gflops", "by",
 )  # fmt: skip
 """What some rows have besides their times."""
 
@@ -75,7 +76,8 @@ def document(facts: Row, rows: list[Row]) -> str:
     repeats = sorted({row["repeats"] for row in rows if row["repeats"] > 1})
     text = [
         f"Made by `{facts['command']}`; medians of at least {min(repeats, default=1)} repeats after a warm-up, "
-        "K = 300, P = 5, M = 200, F = 128, Matern-3/2; one process at a time. "
+        f"K = {NUM_CANDIDATES}, P = {NUM_PARTICLES}, M = {NUM_INDUCING}, F = {NUM_FEATURES}, Matern-3/2; one process "
+        "at a time. "
         f"{facts['processor']}, {facts['cores']} cores, load {facts['load_average_1_min_before']:.1f} before and "
         f"{facts['load_average_1_min_after']:.1f} after; PyTorch {facts['versions']['torch']}, "
         f"revision {facts['revision']}. More versions in `speed.json`.",
