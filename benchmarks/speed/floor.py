@@ -24,7 +24,7 @@ def rollout_flops(case: Case, num_layers: int) -> float:
 
 
 def bare_step(case: Case, num_layers: int) -> Callable[[], None]:
-    """Products, roots, exponentials, cosines and sines of one rollout step, into buffers, particle by particle."""
+    """Products, square roots, exponentials and waves of one rollout step, into buffers, a particle at a time."""
     size = Encoder(case.observation_size, case.action_size, case.spec).input_size
     random = partial(torch.randn, generator=seeded(0))
     points = random(NUM_CANDIDATES, size + 2)

@@ -14,10 +14,11 @@ from torch import Tensor
 from gym_dgpmpc.dynamics.state import take_tensors
 from gym_dgpmpc.types import StateDict
 
-MARGIN = 0.5
+MARGIN = 1.5
 """Of the range of what was seen, by which a step may leave it on either side. The range grows with the data, so the
-first plans know little of it: twice the range leaves them room for what random actions did not show, and noise, while
-a prior that is several ranges wide is cut off."""
+first plans know little of it: four ranges in all leave them room for what random actions did not show, while a prior
+that is many ranges wide is cut off. Where the truth lies beyond the bounds all particles stand on one of them, sure of
+what is wrong, as happened with a margin of a half (docs/calibration.md)."""
 
 
 class SeenTargets(NamedTuple):

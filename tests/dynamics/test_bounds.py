@@ -1,4 +1,4 @@
-"""What bounds a step: what was seen, and half its range on either side."""
+"""What bounds a step: what was seen, and one and a half times its range on either side."""
 
 import math
 
@@ -25,7 +25,7 @@ def same(one, other):
 def test_more_data_widen_what_was_seen_and_never_narrow_it():
     seen = SeenTargets.of(doubles([-1.0, 0.0], [3.0, 0.0], [2.0, 0.0]))
     assert same(seen, (doubles(-1.0, 0.0), doubles(3.0, 0.0)))
-    assert same(seen.bounds(), (doubles(-3.0, 0.0), doubles(5.0, 0.0)))
+    assert same(seen.bounds(), (doubles(-7.0, 0.0), doubles(9.0, 0.0)))
     assert same(seen.and_of(doubles([0.0, 0.0])), seen)
     assert same(seen.and_of(torch.empty(0, 2).double()), seen)
     assert same(seen.and_of(doubles([7.0, -2.0], [0.0, 0.0])), (doubles(-1.0, -2.0), doubles(7.0, 0.0)))
@@ -52,8 +52,8 @@ def test_coordinates_keep_targets_within_their_bounds(dtype, states):
     inputs, targets = Normaliser(doubles(0, 0, 0), doubles(1, 1, 1)), Normaliser(doubles(0.5, 1.0), doubles(2.0, 0.25))
     coordinates = Coordinates(encoder, inputs, targets, dtype, SeenTargets(doubles(-1.0, 0.0), doubles(1.0, 2.0)))
     before = torch.tensor([8.0, 4.0], dtype=states).expand(1, 4, 2)
-    target = torch.tensor([[-1.5, 2.5], [9.0, -math.inf], [-9.0, 3.5], [math.nan, 9.0]], dtype=dtype)
+    target = torch.tensor([[-1.5, 2.5], [9.0, -math.inf], [-9.0, 5.5], [math.nan, 9.0]], dtype=dtype)
     after = coordinates.decode(before, target.unsqueeze(0))[0]
-    # Bounds of -2 and 2, of -1 and 3: sums of powers of two, exact in any precision.
-    expected = [[8 + 0.5 - 3, 1 + 2.5 / 4], [8 + 0.5 + 4, 1 - 1 / 4], [8 + 0.5 - 4, 1 + 3 / 4], [math.nan] * 2]
+    # Bounds of -4 and 4, of -3 and 5: sums of powers of two, exact in any precision.
+    expected = [[8 + 0.5 - 3, 1 + 2.5 / 4], [8 + 0.5 + 8, 1 - 3 / 4], [8 + 0.5 - 8, 1 + 5 / 4], [math.nan] * 2]
     torch.testing.assert_close(after, torch.tensor(expected, dtype=states), rtol=0, atol=0, equal_nan=True)
