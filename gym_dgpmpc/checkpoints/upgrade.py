@@ -17,6 +17,7 @@ SPACES = ("observation_space", "action_space")
 ONE_CHAIN = {"num_chains": 1, "hyperparameters": "optimised"}
 """Arguments that make a deep Gaussian process what it was up to schema 5."""
 OLD_DEFAULTS = {
+    "step_size": 0.02,
     "window_size": 100,
     "hyperparameters_every": 1,
     "learning_rate": 0.01,

@@ -287,7 +287,7 @@ class Chains:
         """
         state = snapshot.state
         self.state = ChainState(
-            _at_rest(state.whitened), _at_rest(state.parameters), [latent.clone() for latent in state.latents]
+            at_rest(state.whitened), at_rest(state.parameters), [latent.clone() for latent in state.latents]
         )
         self._adam = snapshot.adam
         self._window.copy_(snapshot.window)
@@ -335,5 +335,6 @@ def sample(
         yield chains.state.whitened.position
 
 
-def _at_rest(state: SGHMCState) -> SGHMCState:
+def at_rest(state: SGHMCState) -> SGHMCState:
+    """Where it is, without momentum."""
     return state._replace(momentum=torch.zeros_like(state.momentum))

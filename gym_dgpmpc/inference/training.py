@@ -146,8 +146,8 @@ def sample_pool(
 ) -> Sampled:
     """Posterior samples of each chain, ``spacing`` steps apart.
 
-    Begins anew with half the steps if a chain leaves what is plausible. After each sample ``on_sample`` is told how
-    many there are.
+    Begins anew from rest with half the steps if a chain leaves what is plausible. After each sample ``on_sample`` is
+    told how many there are.
 
     Args:
         scale: what training had to multiply steps by.
@@ -166,7 +166,8 @@ def sample_pool(
                     on_sample(len(positions))
         if len(positions) == num_samples and is_plausible(pool := torch.stack(positions)):
             return Sampled(pool, chains.state, scale)
-        scale *= 0.5
+        # Where training has left a chain too fast, no step is short enough to stop it.
+        state, scale = state._replace(whitened=sampler.at_rest(state.whitened)), 0.5 * scale
     raise TrainingError(
         f"sampling the posterior diverged {MAX_ROLLBACKS + 1} times, the last time with the step size "
         f"{2 * scale * settings.step_size:g}: train with a smaller step_size"
