@@ -29,7 +29,7 @@ def bench(
     suite: Annotated[
         str,
         typer.Argument(
-            metavar="SUITE", help="table, comparison, variance, unmodified, long-cheetah, stock or contact."
+            metavar="SUITE", help="table, comparison, fair, variance, unmodified, long-cheetah, stock or contact."
         ),
     ],
     show: Annotated[

@@ -3,15 +3,15 @@
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from benchmarks.report.scores import OURS, PEERS
+from benchmarks.report.scores import OURS
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#7F7F7F", "#8B4513")
 """Okabe and Ito's palette without its black, which is the ceiling's, and its yellow, which is faint on white."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
-KNOWN = (OURS, *PEERS)
-"""Methods whose look does not depend on which others there are."""
+KNOWN = (OURS, "PETS TSinf", "PETS TS1", "GP-MM", "GP-DS", "SAC", "TD3", "PPO")
+"""Methods whose look does not depend on which others there are: as many as there are colours."""
 
 
 class Style(NamedTuple):
