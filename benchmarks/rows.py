@@ -2,9 +2,11 @@
 
 import argparse
 import json
+import multiprocessing
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +36,9 @@ def measure_missing(
     results: Path,
     wanted: Sequence[Row],
     measure: Callable[[Row], Row],
-    settings: argparse.ArgumentParser,
+    settings: argparse.ArgumentParser | None = None,
     page: Callable[[Sequence[Row]], str] | None = None,
+    jobs: int = 1,
 ) -> str:
     """Measure what the benchmark's files do not have, and write them again after each measurement.
 
@@ -44,8 +47,9 @@ def measure_missing(
         results: their folder.
         wanted: for each measurement everything that makes it another one.
         measure: gives the results of one.
-        settings: has the options that are part of each of ``wanted``; for files whose rows do not name them.
+        settings: has the options that are part of each of ``wanted``, for old files whose rows do not name them.
         page: what ``name.md`` says of the rows; default: `document`.
+        jobs: measurements at a time, each in a process of its own if there are several.
 
     Returns:
         The page of all rows, those of other settings included.
@@ -53,15 +57,29 @@ def measure_missing(
     page = document if page is None else page
     file = results / f"{name}.json"
     rows = read_rows(file, settings)
-    for row in wanted:
-        if find(rows, **row) is None:
-            rows.append(row | measure(row) | {"command": command(name), "torch": torch.__version__})
-            replace_text(file, json.dumps({"rows": rows}, indent=2) + "\n")
-            replace_text(results / f"{name}.md", page(rows))
+    missing = [row for row in wanted if find(rows, **row) is None]
+    for row, found in _measured(missing, measure, jobs):
+        rows.append(row | found | {"command": command(name), "torch": torch.__version__})
+        replace_text(file, json.dumps({"rows": rows}, indent=2) + "\n")
+        replace_text(results / f"{name}.md", page(rows))
     return page(rows)
 
 
-def read_rows(file: Path, settings: argparse.ArgumentParser) -> list[Row]:
+def _measured(rows: Sequence[Row], measure: Callable[[Row], Row], jobs: int) -> Iterator[tuple[Row, Row]]:
+    """Each row with its measurement, as it ends."""
+    if jobs == 1:
+        for row in rows:
+            yield row, measure(row)
+        return
+    # Anew, and not as copies of this process, whose threads would be missing.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        row_of = {pool.submit(measure, row): row for row in rows}
+        for future in as_completed(row_of):
+            yield row_of[future], future.result()
+
+
+def read_rows(file: Path, settings: argparse.ArgumentParser | None = None) -> list[Row]:
     """The rows of a file, none if there is no file.
 
     Rows used not to name their settings; they have those that the command of the whole file says.
@@ -69,7 +87,7 @@ def read_rows(file: Path, settings: argparse.ArgumentParser) -> list[Row]:
     if not file.exists():
         return []
     facts = json.loads(file.read_text())
-    if "command" not in facts:
+    if "command" not in facts or settings is None:
         return facts["rows"]
     made_with = vars(settings.parse_known_args(facts["command"].split())[0])
     return [made_with | row | {key: facts[key] for key in ABOUT} for row in facts["rows"]]

@@ -39,23 +39,36 @@ def test_what_is_there_is_not_measured_again(run):
     rows = json.loads((run.folder / "planners.json").read_text())["rows"]
     assert len(rows) == 24 and {(row["num_candidates"], row["num_iterations"]) for row in rows} == {(10, 2), (20, 3)}
     page = (run.folder / "planners.md").read_text()
-    assert "| ModCartPole-v0 | 200 | MPPI | 20 | 3 | 2 | 100.5 | 0.7 | 20.0 |  |" in page
-    assert "| ModCartPole-v0 | 50 | CEM | 10 | 2 | 1 | 100.0 | – | 10.0 | best |" in page
+    assert "| ModCartPole-v0 | true | 200 | MPPI | 20 | 3 | 2 | 100.5 | 0.7 | 20.0 |  |" in page
+    assert "| ModCartPole-v0 | true | 50 | CEM | 10 | 2 | 1 | 100.0 | – | 10.0 | best |" in page
+    assert len(run(*sizes, "--seeds", "100", "--dynamics", "learned")) == 8
 
 
 def test_the_best_earn_more_than_all_that_are_quicker():
-    about = {"environment": "E", "steps": 1, "num_candidates": 1, "num_iterations": 1, "seed": 0, "command": "x"}
+    about = {
+        "environment": "E",
+        "dynamics": "true",
+        "steps": 1,
+        "num_candidates": 1,
+        "num_iterations": 1,
+        "seed": 0,
+        "command": "x",
+    }
     found = {"slow": (5.0, 30.0), "quick": (1.0, 10.0), "poor": (0.5, 20.0), "equal": (5.0, 40.0)}
     rows = [{**about, "planner": name, "return": value, "plan_cpu_ms": cost} for name, (value, cost) in found.items()]
     rows.append({**rows[0], "environment": "F"})
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in planners.page(rows).splitlines()[4:]]
-    assert [(line[2], line[-1]) for line in lines] == [
+    assert [(line[3], line[-1]) for line in lines] == [
         ("quick", "best"), ("poor", ""), ("slow", "best"), ("equal", ""), ("slow", "best"),
     ]  # fmt: skip
 
 
-def test_every_planner_is_measured_with_the_simulator():
-    about = {"environment": "ModCartPole-v0", "steps": 3, "num_candidates": 6, "num_iterations": 1, "seed": 100}
+@pytest.mark.parametrize("dynamics", ["true", "learned"])
+def test_every_planner_is_measured(dynamics, monkeypatch):
+    about = {"environment": "ModCartPole-v0", "dynamics": dynamics, "steps": 3, "seed": 100}
+    small = {"num_inducing": 10, "first_training_iterations": 20, "num_samples": 10, "sample_spacing": 1}
+    task = dict(planners.settings_for("ModCartPole-v0"))
+    monkeypatch.setattr(planners, "settings_for", lambda env_id: {**task, **small})
     for planner in planners.VARIANTS:
-        row = planners.measure({**about, "planner": planner})
+        row = planners.measure({**about, "planner": planner, "num_candidates": 6, "num_iterations": 1})
         assert -3 < row["return"] < 3 and row["plan_cpu_ms"] > 0
