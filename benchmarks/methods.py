@@ -19,9 +19,10 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from benchmarks.tasks import Task
 from gym_dgpmpc.agents import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent, presets
+from gym_dgpmpc.agents.exploration import ExplorationName
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.gp.kernels import KERNELS
-from gym_dgpmpc.planning import planner_factory
+from gym_dgpmpc.planning import PLANNERS, planner_factory
 from gym_dgpmpc.settings import settings_of
 
 NO_SETTINGS = {
@@ -54,8 +55,8 @@ Presets = Callable[[Task], Mapping[str, Any]]
 class PlanningMethod:
     """A method that learns a model and plans with it, or plans with the true one.
 
-    It plans by CEM unless ``fixed`` or what is asked for names another ``planner``; then the settings of CEM
-    give way to those of that planner.
+    It plans by CEM unless presets or what is asked for name another ``planner``. Presets of planners that it does not
+    plan by do not count.
 
     Attributes:
         name: its name in a report.
@@ -78,12 +79,12 @@ class PlanningMethod:
             ValueError: the agent has no argument of a name that is asked for.
         """
         given = {**self.presets(task), **self.fixed, **task.for_planning}
-        defaults, planner = _defaults(self.make_agent), {"planner": "cem", **given, **asked}["planner"]
-        if planner != "cem":
-            mine, cems = settings_of(planner_factory(planner)), settings_of(planner_factory("cem"))
-            given = {name: value for name, value in given.items() if name in mine or name not in cems}
-            defaults = {name: value for name, value in defaults.items() if name not in cems}
-            defaults |= {name: setting.default for name, setting in mine.items()}
+        mine = settings_of(planner_factory({"planner": "cem", **given, **asked}["planner"]))
+        of_others = {name for other in PLANNERS for name in settings_of(planner_factory(other))} - set(mine)
+        defaults = {**{name: setting.default for name, setting in mine.items()}, **_defaults(self.make_agent)}
+        defaults, given = (
+            {name: value for name, value in settings.items() if name not in of_others} for settings in (defaults, given)
+        )
         return _complete(self.name, defaults, given, asked)
 
     def make(self, env: gymnasium.Env, settings: Settings, seed: int, **arguments: Any) -> MPCAgent:
@@ -135,15 +136,18 @@ Method = PlanningMethod | ModelFreeMethod
 def true_dynamics_agent(
     env: gymnasium.Env,
     *,
+    planner: str = "cem",
     horizon: int = 30,
     num_candidates: int = 300,
     num_elites: int | None = None,
     num_iterations: int = 5,
     actions_per_plan: int = 1,
+    exploration: ExplorationName = "uniform",
     learning_starts: int | None = None,
     seed: int | None = None,
     verbose: int = 0,
     tensorboard_log: str | None = None,
+    **of_planner: Any,
 ) -> MPCAgent:
     """An agent that plans with the simulator itself, in one world.
 
@@ -156,16 +160,19 @@ def true_dynamics_agent(
     return MPCAgent(
         env,
         TrueDynamics(env),
+        planner=planner,
         horizon=horizon,
         num_candidates=num_candidates,
         num_elites=num_elites,
         num_iterations=num_iterations,
         num_particles=1,
         actions_per_plan=actions_per_plan,
+        exploration=exploration,
         learning_starts=learning_starts,
         seed=seed,
         verbose=verbose,
         tensorboard_log=tensorboard_log,
+        **of_planner,
     )
 
 
@@ -185,8 +192,10 @@ def _planning(task: Task) -> Mapping[str, Any]:
 
 
 def _planning_alone(task: Task) -> Mapping[str, Any]:
-    names = inspect.signature(true_dynamics_agent).parameters
-    return {name: value for name, value in _planning(task).items() if name in names}
+    settings = _planning(task)
+    of_planner = settings_of(planner_factory(settings.get("planner", "cem")))
+    names = {*inspect.signature(true_dynamics_agent).parameters, *of_planner}
+    return {name: value for name, value in settings.items() if name in names}
 
 
 def _off_policy(task: Task) -> Mapping[str, Any]:
@@ -200,8 +209,9 @@ def _on_policy(task: Task) -> Mapping[str, Any]:
     return {"n_steps": task.episode_steps, "batch_size": max(divisors)}
 
 
-def _of(table: Mapping[str, Mapping[str, Any]]) -> Presets:
-    return lambda task: table.get(task.preset, {})
+def _of(*tables: Mapping[str, Mapping[str, Any]]) -> Presets:
+    """What tables have for a task, the later ones over the earlier."""
+    return lambda task: {name: value for table in tables for name, value in table.get(task.preset, {}).items()}
 
 
 def _defaults(made_by: Callable[..., Any]) -> Settings:
@@ -231,13 +241,21 @@ ALL_METHODS: tuple[Method, ...] = (
     PlanningMethod(
         "PETS TSinf to its optimum",
         PETSAgent,
-        _of(presets.COMPARISON_PETS),
+        _of(presets.COMPARISON_PETS, presets.PLANNING),
         {"draw": "TSinf", **OPTIMUM, **_FASTER},
     ),
     *(
-        PlanningMethod(f"GP-{draw}{name}", GPMPCAgent, _of(presets.COMPARISON_GP), {"draw": draw, "add_noise": noise})
+        PlanningMethod(f"GP-{draw}", GPMPCAgent, _of(presets.COMPARISON_GP), {"draw": draw, "add_noise": False})
         for draw in ("MM", "DS")
-        for name, noise in (("", False), (" with noise", True))
+    ),
+    *(
+        PlanningMethod(
+            f"GP-{draw} with noise",
+            GPMPCAgent,
+            _of(presets.COMPARISON_GP, presets.PLANNING),
+            {"draw": draw, "add_noise": True},
+        )
+        for draw in ("MM", "DS")
     ),
     PlanningMethod("true dynamics", true_dynamics_agent, _planning_alone),
     ModelFreeMethod("SAC", SAC, _off_policy),

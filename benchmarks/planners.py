@@ -22,8 +22,8 @@ from benchmarks.report import markdown
 from benchmarks.rows import Row, made_by, measure_missing
 from gym_dgpmpc import DGPMPCAgent, MPCAgent
 from gym_dgpmpc.agents.presets import settings_for
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
-from gym_dgpmpc.planning.cem import CEM
 from gym_dgpmpc.settings import settings_of
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -81,9 +81,9 @@ def _with_a_learned_model(wanted: Row) -> MPCAgent:
     """Trained on the first episodes of the recorded run of this seed, with the settings for the task."""
     env_id, seed = wanted["environment"], wanted["seed"]
     env = gymnasium.make(env_id, max_episode_steps=wanted["steps"])
-    settings = {name: value for name, value in settings_for(env_id).items() if name not in settings_of(CEM)}
-    kept = {name: value for name, value in settings_for(env_id).items() if name == "horizon"}
-    agent = DGPMPCAgent(env, seed=seed, **{**settings, **kept, **_planner(wanted)})
+    names = {*settings_of(DeepGPDynamics), "horizon", "num_particles", "actions_per_plan"}
+    settings = {name: value for name, value in settings_for(env_id).items() if name in names}
+    agent = DGPMPCAgent(env, seed=seed, **settings, **_planner(wanted))
     data = load(RECORDED[env_id], seed).transitions(range(NUM_RECORDED))
     assert agent.task.functions.reward_fn is not None
     columns = {name: value.numpy() for name, value in data._asdict().items()}

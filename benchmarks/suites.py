@@ -214,6 +214,7 @@ _OF_RUNS = (
         "the paper's tasks with seeds that nothing was developed on, every method trained as long as it needs",
         _paper((dgp_mpc(2, "matern32"), dgp_mpc(3, "matern32"), *FAIR)),
         seeds=FAIR_SEEDS,
+        results=RESULTS / "fair",
     ),
     RunSuite(
         "variance",

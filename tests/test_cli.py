@@ -18,10 +18,11 @@ from typer.testing import CliRunner
 from gym_dgpmpc import cli
 from gym_dgpmpc.agents import DGPMPCAgent
 from gym_dgpmpc.agents.exploration import ExplorationName
-from gym_dgpmpc.agents.presets import PAPER, STOCK
+from gym_dgpmpc.agents.presets import OF_A_TASK, PLANNING, STOCK
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.checkpoints.format import read_checkpoint
 from gym_dgpmpc.cli import options
+from gym_dgpmpc.cli.train import _fill_in
 from gym_dgpmpc.dynamics.deep_gp.draws import DRAWS, REFRESHES
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.planning import PLANNERS, register_planner
@@ -327,10 +328,22 @@ def test_every_plain_setting_is_an_option(run):
     assert len(plain) > 20
     for name in set(plain) - options.SET_BY_THE_RUN:
         assert f"--{name.replace('_', '-')}" in shown
-        preset = any(name in each for each in (*PAPER.values(), *STOCK.values()))
+        preset = any(name in each for table in OF_A_TASK for each in table.values())
         assert f"{settings[name].default}{' or the preset' if preset else ''}" in shown
     for choices in (KERNELS, DRAWS, REFRESHES, PLANNERS):
         assert "|".join(choices) in shown
+
+
+def test_the_preset_chooses_the_planner_unless_another_is_asked_for():
+    better = PLANNING["ModCartPole-v0"]
+    filled = _fill_in(
+        "ModCartPole-v0", {"planner": None, "noise_beta": None, "exploration": None, "num_candidates": None}
+    )
+    assert filled == {**filled, **better, "num_candidates": 300}
+    asked = {"planner": "cem", "noise_beta": None, "exploration": None, "smoothing": None}
+    assert "noise_beta" not in _fill_in("ModCartPole-v0", asked)
+    shown = re.sub(r"[\s│]+", " ", run_wide("train", "--help"))
+    assert "[default: (cem or the preset's for ENV_ID)]" in shown
 
 
 def run_wide(*arguments):

@@ -77,15 +77,30 @@ DEEP_GP = MappingProxyType(
 """Settings of the deep Gaussian process for a task that are not the paper's, and better (docs/calibration.md)."""
 
 
+_CART_POLE_PLANNING = MappingProxyType({"planner": "icem", "noise_beta": 1.0, "exploration": "held"})
+
+PLANNING = MappingProxyType(
+    {
+        "ModCartPole-v0": _CART_POLE_PLANNING,
+        "SwingUpCartPole-v0": _CART_POLE_PLANNING,
+    }
+)
+"""How to plan and to explore where that earns more than the paper's way (docs/planning.md), whatever the model."""
+
+
+OF_A_TASK: tuple[Mapping[str, Mapping[str, Any]], ...] = (PAPER, STOCK, DEEP_GP, PLANNING)
+"""What `settings_for` lays over each other, the later ones over the earlier."""
+
+
 def settings_for(env_id: str) -> Mapping[str, Any]:
-    """Settings of `DGPMPCAgent` for a task: the paper's and `DEEP_GP`'s if they have it, else `STOCK`'s, else none.
+    """Settings of `DGPMPCAgent` for a task, none if it has no preset.
 
     Args:
         env_id: id of the environment, with or without a module before it that registers it
             ("gym_dgpmpc.envs.robotics:FetchReachDense-v4").
     """
-    name = env_id.rpartition(":")[2]
-    return {**PAPER.get(name, {}), **STOCK.get(name, {}), **DEEP_GP.get(name, {})}
+    task = env_id.rpartition(":")[2]
+    return {name: value for table in OF_A_TASK for name, value in table.get(task, {}).items()}
 
 
 REAL_TIME = MappingProxyType(

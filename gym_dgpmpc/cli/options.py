@@ -54,7 +54,9 @@ def _options() -> Iterable[inspect.Parameter]:
     groups = [("Model", model), ("Planner", {n: s for n, s in own.items() if n in _PLANNING})]
     groups += [("Planner", settings_of(planner_factory(name))) for name in PLANNERS]
     groups += [("Training", {n: s for n, s in own.items() if n not in _PLANNING})]
-    yield _option("planner", _choice("planner", tuple(PLANNERS)), PLANNER_TEXT, "cem", "Planner")
+    yield _option(
+        "planner", _choice("planner", tuple(PLANNERS)), PLANNER_TEXT, _or_the_presets("planner", ["cem"]), "Planner"
+    )
     for panel, settings in groups:
         for setting in settings.values():
             kind = _option_type(setting)
@@ -100,9 +102,14 @@ def _choice(name: str, choices: Iterable[str]) -> Any:
 
 def _default_text(setting: Setting) -> str | bool:
     """The text of the default; False where the option's own text says it."""
-    is_preset = any(setting.name in preset for preset in (*presets.PAPER.values(), *presets.STOCK.values()))
     texts = [] if setting.default is None else [str(setting.default)]
-    return " or ".join([*texts, *(["the preset's for ENV_ID"] if is_preset else [])]) or False
+    return _or_the_presets(setting.name, texts) or False
+
+
+def _or_the_presets(name: str, texts: list[str]) -> str:
+    """A default with a word of presets, if any task has one for this setting."""
+    is_preset = any(name in preset for table in presets.OF_A_TASK for preset in table.values())
+    return " or ".join([*texts, *(["the preset's for ENV_ID"] if is_preset else [])])
 
 
 def _plain_value(value: Any) -> Any:

@@ -171,13 +171,13 @@ def _fill_in(env_id: str, asked: dict[str, Any]) -> dict[str, Any]:
     from gym_dgpmpc.agents import DGPMPCAgent
     from gym_dgpmpc.agents.presets import settings_for
 
-    given = {name: value for name, value in asked.items() if value is not None}
-    planner = given.setdefault("planner", "cem")
+    given, preset = {name: value for name, value in asked.items() if value is not None}, settings_for(env_id)
+    planner = given.setdefault("planner", preset.get("planner", "cem"))
     known = {**DGPMPCAgent.own_settings(), **DGPMPCAgent.part_settings(planner)}
     others = {"planner", "reward_fn", "terminated_fn"}
     refuse_unknown(f"an agent that plans by {planner}", given, {*known, *others})
     filled = {name: known[name].default if name in known else None for name in asked if name in {*known, *others}}
-    filled |= {name: value for name, value in settings_for(env_id).items() if name in known}
+    filled |= {name: value for name, value in preset.items() if name in known}
     if "num_candidates" in given and "num_elites" in filled:
         filled["num_elites"] = None  # the preset's elites are a part of the preset's candidates
     return filled | given

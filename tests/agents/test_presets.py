@@ -8,6 +8,7 @@ import pytest
 
 from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, PETSAgent
 from gym_dgpmpc.agents import presets
+from gym_dgpmpc.planning import PLANNERS
 
 
 @pytest.mark.parametrize("env_id", sorted(presets.STOCK))
@@ -26,7 +27,8 @@ def test_stock_settings_make_an_agent(env_id):
 
 
 def test_settings_are_found_by_id():
-    assert presets.settings_for("ModCartPole-v0") == presets.PAPER["ModCartPole-v0"]
+    for env_id in ("ModCartPole-v0", "SwingUpCartPole-v0"):
+        assert presets.settings_for(env_id) == {**presets.PAPER[env_id], **presets.PLANNING[env_id]}
     assert presets.settings_for("Pendulum-v1") == presets.STOCK["Pendulum-v1"]
     half_cheetah = presets.settings_for("VelocityHalfCheetah-v0")
     own = {"linear": True, "first_training_iterations": 300}
@@ -95,3 +97,15 @@ def test_the_papers_plans_are_those_of_its_table(task, planned):
     assert (settings["horizon"], settings["num_iterations"], settings["actions_per_plan"]) == planned
     assert (settings["num_candidates"], settings["num_particles"]) == (300, 5)
     assert "num_inducing" not in settings and presets.COMPARISON_GP[task]["num_inducing"] == 200
+
+
+@pytest.mark.parametrize("env_id", presets.PLANNING)
+@pytest.mark.parametrize(
+    ("agent_class", "table"),
+    [(DGPMPCAgent, presets.PAPER), (PETSAgent, presets.COMPARISON_PETS), (GPMPCAgent, presets.COMPARISON_GP)],
+)
+def test_better_planning_is_for_every_model(env_id, agent_class, table):
+    better = presets.PLANNING[env_id]
+    agent = agent_class(gymnasium.make(env_id), **{**table[env_id], **better}, seed=0)
+    assert isinstance(agent.planner, PLANNERS[better["planner"]])
+    assert (agent.planner.noise_beta, agent.exploration) == (better["noise_beta"], better["exploration"])
