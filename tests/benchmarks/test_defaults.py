@@ -9,7 +9,7 @@ from benchmarks import defaults
 from gym_dgpmpc.agents import presets
 from tests.runs.toy import SMALLEST_AGENT
 
-CART_POLE, CHEETAH = defaults.LEARNING
+CART_POLE, CHEETAH = defaults.PROTOCOL[2:]
 
 
 @pytest.fixture
@@ -76,9 +76,9 @@ def test_rows_of_former_defaults_stay_what_they_were(run, monkeypatch):
 
 
 def test_of_a_planner_its_own_settings_are_named_only_where_they_differ(run):
-    run("planner=icem", "planner=icem,noise_beta=1.5", "--stages", CART_POLE, "--seeds", "100")
+    run("planner=mppi", "planner=mppi,temperature=0.3", "--stages", CART_POLE, "--seeds", "100")
     named = [line.split(" |")[0] for line in lines(run) if line.startswith("| ")]
-    assert named[2:] == ["| planner=icem", "| planner=icem, noise_beta=1.5"]
+    assert named[2:] == ["| planner=mppi", "| planner=mppi, temperature=0.3"]
 
 
 @pytest.mark.parametrize("text", ["kernel", "=1", "a b=1", ""])
