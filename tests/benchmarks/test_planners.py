@@ -69,6 +69,7 @@ def test_every_planner_is_measured(dynamics, monkeypatch):
     small = {"num_inducing": 10, "first_training_iterations": 20, "num_samples": 10, "sample_spacing": 1}
     task = dict(planners.settings_for("ModCartPole-v0"))
     monkeypatch.setattr(planners, "settings_for", lambda env_id: {**task, **small})
-    for planner in planners.VARIANTS:
+    monkeypatch.setattr(planners, "NUM_RECORDED", 1)
+    for planner in planners.VARIANTS if dynamics == "true" else ("CEM", "iCEM, beta 1", "MPPI"):
         row = planners.measure({**about, "planner": planner, "num_candidates": 6, "num_iterations": 1})
         assert -3 < row["return"] < 3 and row["plan_cpu_ms"] > 0
