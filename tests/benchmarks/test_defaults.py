@@ -44,7 +44,7 @@ def lines(run):
 def test_a_variant_is_measured_beside_the_defaults(run):
     rows = run("kernel=rbf")
     by_stage = {stage: sum(row["stage"] == stage for row in rows) for stage in (*defaults.KNOWING, CART_POLE, CHEETAH)}
-    assert by_stage == {"cartpole": 10, "cheetah": 10, CART_POLE: 10, CHEETAH: 6}
+    assert by_stage == {"cartpole": 10, "cheetah": 10, "pendulum": 0, "reacher": 0, CART_POLE: 10, CHEETAH: 6}
     assert {row["settings"]["kernel"] for row in rows} == {
         "rbf",
         presets.settings_for(CART_POLE).get("kernel", "matern32"),
