@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from gym_dgpmpc import cli
 from gym_dgpmpc.agents import DGPMPCAgent
 from gym_dgpmpc.agents.exploration import ExplorationName
-from gym_dgpmpc.agents.presets import OF_A_TASK, PLANNING, STOCK
+from gym_dgpmpc.agents.presets import OF_A_TASK, PLANNING, settings_for
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.checkpoints.format import read_checkpoint
 from gym_dgpmpc.cli import options
@@ -114,7 +114,7 @@ def test_settings_of_a_stock_task_are_taken_unless_others_are_asked_for(run, tmp
     result = run("train", "Pendulum-v1", "--no-video", "--timesteps", 2, "--candidates", 50, "--out", "a")
     assert result.exit_code == 0, result.output
     settings = json.loads((tmp_path / "a" / "settings.json").read_text())["settings"]
-    expected = {**STOCK["Pendulum-v1"], "num_candidates": 50}
+    expected = {**settings_for("Pendulum-v1"), "num_candidates": 50}
     assert expected == {name: settings[name] for name in expected}
 
 

@@ -29,7 +29,7 @@ def test_stock_settings_make_an_agent(env_id):
 def test_settings_are_found_by_id():
     for env_id in ("ModCartPole-v0", "SwingUpCartPole-v0"):
         assert presets.settings_for(env_id) == {**presets.PAPER[env_id], **presets.PLANNING[env_id]}
-    assert presets.settings_for("Pendulum-v1") == presets.STOCK["Pendulum-v1"]
+    assert presets.settings_for("Pendulum-v1") == {**presets.STOCK["Pendulum-v1"], "kernel": "rbf"}
     half_cheetah = presets.settings_for("VelocityHalfCheetah-v0")
     own = {"linear": True, "first_training_iterations": 300}
     assert half_cheetah == {**presets.PAPER["VelocityHalfCheetah-v0"], **own}
