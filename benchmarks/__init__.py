@@ -5,7 +5,7 @@
 - `jobs` and `executors` do the work, on this machine or on a cluster, and `listing` says what is left to do;
 - `result_files` reads and writes what runs leave, and `report` makes tables and figures of it;
 - `contact` is the study of a cart that hits the end of its rail, `speed` what plans and training cost;
-- `ablation`, `calibration`, `noise`, `planners`, `real_time` and `fingerprint` are small studies of their own:
+- `calibration`, `defaults`, `noise`, `planners`, `real_time` and `fingerprint` are small studies of their own:
   `python -m benchmarks.NAME`.
 """
 
