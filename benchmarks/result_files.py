@@ -35,6 +35,10 @@ class Episode(NamedTuple):
     """Wall-clock time of the episode, training included."""
     success: bool | None = None
     """Whether the goal was reached in the last step; None for tasks that do not say so in ``info["is_success"]``."""
+    cpu_seconds: float | None = None
+    """Time on the processor in ``seconds``; None in older files."""
+    training_iterations: int | None = None
+    """Iterations of the training before it, in the method's own count (PPO's are epochs); None in older files."""
 
 
 class RunKey(NamedTuple):

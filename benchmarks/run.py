@@ -235,7 +235,8 @@ def _as_in_files(settings: Settings) -> Settings:
 
 def _episode(row: EpisodeRow) -> Episode:
     actions: Actions = "planned" if row.actions == "planned" else "random"
-    return Episode(actions, row.episode_return, row.steps, row.total_steps, row.seconds, row.success)
+    costs = row.cpu_seconds, row.training_iterations
+    return Episode(actions, row.episode_return, row.steps, row.total_steps, row.seconds, row.success, *costs)
 
 
 def _patiently(open_folder: Callable[[], RunFolder]) -> RunFolder:
@@ -286,14 +287,14 @@ class _EpisodeList(BaseCallback):
         super().__init__()
         self.recorder, self.num_random = recorder, num_random
         self.found: list[Episode] = []
-        self._since = time.perf_counter()
+        self._since, self._cpu_since, self._updates = time.perf_counter(), time.process_time(), 0
 
     def _on_step(self) -> bool:
         if not self.locals["dones"][0]:
             return True
         episode, success = self.recorder.last, self.locals["infos"][0].get("is_success")
         assert episode is not None
-        now = time.perf_counter()
+        now, cpu_now, updates = time.perf_counter(), time.process_time(), int(getattr(self.model, "_n_updates", 0))
         self.found.append(
             Episode(
                 actions="random" if self.num_timesteps - len(episode.rewards) < self.num_random else "policy",
@@ -302,7 +303,9 @@ class _EpisodeList(BaseCallback):
                 total_steps=self.num_timesteps,
                 seconds=round(now - self._since, 3),
                 success=None if success is None else bool(success),
+                cpu_seconds=round(cpu_now - self._cpu_since, 3),
+                training_iterations=updates - self._updates,
             )
         )
-        self._since = now
+        self._since, self._cpu_since, self._updates = now, cpu_now, updates
         return True

@@ -227,6 +227,9 @@ def _check(result: RunResult, path: Path) -> None:
         for name in ("episode_return", "seconds"):
             if not _is_number(getattr(episode, name)):
                 refuse(f"{what} has {name} {getattr(episode, name)!r}, expected a finite number")
+        for name in ("cpu_seconds", "training_iterations"):
+            if (value := getattr(episode, name)) is not None and not _is_number(value):
+                refuse(f"{what} has {name} {value!r}, expected a finite number or null")
         if not (type(episode.steps) is int and type(episode.total_steps) is int and episode.steps > 0):
             refuse(f"{what} has steps {episode.steps!r} of {episode.total_steps!r}, expected positive integers")
         if episode.total_steps < max(steps, episode.steps):

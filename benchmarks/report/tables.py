@@ -174,7 +174,7 @@ def success_table(runs: Runs) -> list[str]:
 
 
 def time_table(runs: Runs) -> list[str]:
-    """Wall-clock time of whole runs and of choosing an action."""
+    """What whole runs cost in time and training, and what choosing an action does."""
     rows = []
     for method in scores.ranked(runs):
         results = runs[method]
@@ -183,10 +183,21 @@ def time_table(runs: Runs) -> list[str]:
         measured = [r.milliseconds_per_action for r in results if r.milliseconds_per_action is not None]
         per_step = 60e3 * sum(minutes) / steps
         action = _mean_and_range(measured) if measured else "not measured"
-        rows.append([method, str(len(results)), _mean_and_range(minutes),
-                     number(per_step), action])  # fmt: skip
-    header = ["method", "seeds", "minutes a run (range)", "ms a step, training included", "ms an action (range)"]
+        rows.append([method, str(len(results)), _mean_and_range(minutes), _total(results, "cpu_seconds", 1 / 60),
+                     _total(results, "training_iterations"), number(per_step), action])  # fmt: skip
+    header = ["method", "seeds", "minutes a run (range)", "CPU minutes (range)", "training iterations (range)",
+              "ms a step, training included", "ms an action (range)"]  # fmt: skip
     return table(header, rows)
+
+
+def _total(results: Sequence[RunResult], name: str, unit: float = 1.0) -> str:
+    """A cost of whole runs, of those whose episodes all say it."""
+    totals = []
+    for result in results:
+        costs = [getattr(episode, name) for episode in result.episodes]
+        if None not in costs:
+            totals.append(unit * sum(costs))
+    return _mean_and_range(totals) if totals else "not measured"
 
 
 def at_equal_steps(runs: Runs) -> tuple[dict[str, Sequence[RunResult]], dict[str, Float[ndarray, " _"]]]:

@@ -26,7 +26,9 @@ class EpisodeRecord:
 
     def __init__(self, number: int, horizon: int):
         self.number, self.horizon = number, horizon
-        self._started = time.perf_counter()
+        self._started, self._cpu_started = time.perf_counter(), time.process_time()
+        self.training_iterations = 0
+        """Steps of the optimiser, or of the sampler, in the trainings since the episode began."""
         self.rewards: list[float] = []
         self.plans: list[PlanInfo] = []
         self.plan_steps: list[int] = []
@@ -62,6 +64,11 @@ class EpisodeRecord:
     def seconds(self) -> float:
         """Wall-clock time since the episode began, training included; not the time in which the run was interrupted."""
         return time.perf_counter() - self._started
+
+    @property
+    def cpu_seconds(self) -> float:
+        """This process's time on the processor, over the same time; that of all threads."""
+        return time.process_time() - self._cpu_started
 
     def predicted_and_obtained(self) -> tuple[float, float]:
         """Reward per step: what the plans expected over their horizons, and what was obtained over the same steps.
@@ -130,6 +137,8 @@ class EpisodeRecord:
             "num_late": _column(self.num_late, torch.int64),
             "has_terminated": _column(self.has_terminated, torch.bool),
             "seconds": _column(self.seconds),
+            "cpu_seconds": _column(self.cpu_seconds),
+            "training_iterations": _column(self.training_iterations, torch.int64),
         }
 
     def _metric_columns(self) -> dict[str, Tensor]:
@@ -162,6 +171,9 @@ class EpisodeRecord:
         self.num_late = int(state["num_late"])
         self.has_terminated = bool(state.get("has_terminated", False))  # older files do not say
         self._started = time.perf_counter() - float(state["seconds"])
+        # Older files have neither.
+        self._cpu_started = time.process_time() - float(state.get("cpu_seconds", 0.0))
+        self.training_iterations = int(state.get("training_iterations", 0))
 
 
 def _column(values: Any, dtype: torch.dtype = torch.float64) -> Tensor:

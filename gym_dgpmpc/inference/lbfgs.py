@@ -25,7 +25,7 @@ class Maximum(NamedTuple):
 
     model: DeepGP
     bound: float  # nats per datum and output
-    num_evaluations: int
+    num_iterations: int
 
 
 def maximise_bound(
@@ -87,4 +87,4 @@ def maximise_bound(
         callback=report,
         options={"maxiter": max_iterations},
     )
-    return Maximum(unpack(torch.from_numpy(found.x).to(data.x)), -float(found.fun), int(found.nfev))
+    return Maximum(unpack(torch.from_numpy(found.x).to(data.x)), -float(found.fun), len(losses))

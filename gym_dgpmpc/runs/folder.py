@@ -45,11 +45,17 @@ class EpisodeRow(NamedTuple):
     """The part of that time in which plans were made."""
     success: bool | None = None
     """Whether the goal was reached in the last step, for tasks that say so in ``info["is_success"]``."""
+    cpu_seconds: float | None = None
+    """Time on the processor in ``seconds``; None in older files."""
+    training_iterations: int | None = None
+    """Iterations of the training before it; None in older files."""
 
     @classmethod
     def from_text(cls, row: dict[str, str]) -> "EpisodeRow":
         """A row as `csv.DictReader` reads it; older versions lack the last columns."""
-        success = row.get("success") or None
+        success, cpu_seconds, iterations = (
+            row.get(name) or None for name in ("success", "cpu_seconds", "training_iterations")
+        )
         return cls(
             int(row["episode"]),
             row["actions"],
@@ -59,6 +65,8 @@ class EpisodeRow(NamedTuple):
             float(row["seconds"]),
             float(row.get("planning_seconds", 0.0)),
             None if success is None else success == str(True),
+            None if cpu_seconds is None else float(cpu_seconds),
+            None if iterations is None else int(iterations),
         )
 
 

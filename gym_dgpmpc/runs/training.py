@@ -173,6 +173,8 @@ class _KeepEpisodes(BaseCallback):
             seconds=round(record.seconds, 3),
             planning_seconds=round(sum(record.plan_seconds), 3),
             success=None if success is None else bool(success),
+            cpu_seconds=round(record.cpu_seconds, 3),
+            training_iterations=record.training_iterations,
         )
         folder.write_rows([*rows, row])
         is_last = sum(row.actions == "planned" for row in [*rows, row]) == self.run.num_episodes

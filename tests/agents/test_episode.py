@@ -93,7 +93,9 @@ def test_a_record_of_an_older_file():
 def test_the_time_of_an_episode_goes_on_without_that_between(monkeypatch):
     clock = [100.0]
     monkeypatch.setattr(episode.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(episode.time, "process_time", lambda: clock[0] / 2)
     record = EpisodeRecord(3, 2)
+    record.training_iterations = 7
     clock[0] = 130.0
     state = record.state_dict()
     clock[0] = 1000.0
@@ -101,6 +103,10 @@ def test_the_time_of_an_episode_goes_on_without_that_between(monkeypatch):
     loaded.load_state_dict(state)
     clock[0] = 1005.0
     assert loaded.seconds == loaded.metrics()["time/ep_seconds"] == 35.0
+    assert (loaded.cpu_seconds, loaded.training_iterations) == (17.5, 7)
+    older = {name: value for name, value in state.items() if name not in ("cpu_seconds", "training_iterations")}
+    loaded.load_state_dict(older)
+    assert (loaded.cpu_seconds, loaded.training_iterations) == (0.0, 0)
 
 
 def test_the_line_tells_of_candidates_that_diverged():

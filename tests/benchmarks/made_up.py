@@ -19,17 +19,19 @@ def run(
     command: str = "dgpmpc bench some --seeds 0",
     versions: dict[str, str] | None = None,
     milliseconds: float | None = 5.0,
+    cpu_seconds: float | None = None,
+    iterations: int | None = None,
 ) -> RunResult:
     """One run of episodes with these returns, after a random one of ``random`` if that is given."""
     lengths = [steps] * len(returns) if isinstance(steps, int) else list(steps)
     episodes, total = [], 0
     if random is not None:
         total += lengths[0]
-        episodes.append(Episode("random", random, lengths[0], total, seconds))
+        episodes.append(Episode("random", random, lengths[0], total, seconds, None, cpu_seconds, iterations))
     for index, (value, length) in enumerate(zip(returns, lengths, strict=True)):
         total += length
         succeeded = None if success is None else success[index]
-        episodes.append(Episode("planned", value, length, total, seconds, succeeded))
+        episodes.append(Episode("planned", value, length, total, seconds, succeeded, cpu_seconds, iterations))
     return RunResult(
         RunKey(method, task, seed), tuple(episodes), {"horizon": 30}, milliseconds,
         f"2026-01-0{seed + 1}T00:00:00+00:00", command, revision,

@@ -48,7 +48,10 @@ def test_every_method_leaves_its_result(method, folders):
     assert {episode.steps for episode in result.episodes} == {EPISODE_STEPS}
     acting = "policy" if METHODS[method].is_model_free else "planned"
     assert [episode.actions for episode in result.episodes] == ["random"] * is_random + [acting] * (count - is_random)
-    assert all(episode.seconds >= 0 for episode in result.episodes)
+    assert all(episode.seconds >= 0 and episode.cpu_seconds >= 0 for episode in result.episodes)
+    # Whatever learns has been trained before its last episode, and before the first one nothing has.
+    trained = [episode.training_iterations for episode in result.episodes]
+    assert (trained[-1] > 0) == (method != "true dynamics") and (method == "PPO" or trained[0] == 0)
     assert result.milliseconds_per_action > 0
     assert result.num_steps == (EPISODE_STEPS * count if METHODS[method].is_model_free else None)
     assert result.settings == json.loads(json.dumps(run.settings))

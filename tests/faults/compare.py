@@ -11,9 +11,9 @@ from tensorboard.compat.proto.event_pb2 import Event
 
 from gym_dgpmpc.checkpoints.format import read_checkpoint
 
-CLOCK = re.compile(r"\d+\.record\.(plan_)?seconds|ep_info\.t")
+CLOCK = re.compile(r"\d+\.record\.(plan_|cpu_)?seconds|ep_info\.t")
 """Names of tensors of a checkpoint that tell the time."""
-CLOCK_COLUMNS = {"seconds", "planning_seconds"}
+CLOCK_COLUMNS = {"seconds", "planning_seconds", "cpu_seconds"}
 CLOCK_TAGS = ("time/", "train/seconds")
 
 

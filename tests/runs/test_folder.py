@@ -59,7 +59,10 @@ def test_overwrites_only_when_asked(finished):
 
 @pytest.mark.parametrize("success", [True, False, None])
 def test_what_is_written_of_an_episode_is_read_again(tmp_path, success):
-    rows = [EpisodeRow(1, "planned", -0.125, 12, 12, 2.5, 1.25, success)]
+    rows = [
+        EpisodeRow(1, "planned", -0.125, 12, 12, 2.5, 1.25, success, 2.25, 300),
+        EpisodeRow(2, "planned", -0.125, 12, 24, 2.5, 1.25, success),
+    ]
     folder = RunFolder(tmp_path, SETTINGS)
     folder.write_rows(rows)
     folder.close()

@@ -44,6 +44,11 @@ def test_results(tmp_path, capsys):
     assert all(row.seconds > 0 for row in rows)
     assert [row.planning_seconds > 0 for row in rows] == [False, True, True]
     assert all(row.planning_seconds < row.seconds for row in rows)
+    assert all(row.cpu_seconds > 0 for row in rows)
+    # Of the training that comes before the episode.
+    assert [row.training_iterations for row in rows] == [
+        0, SMALLEST_AGENT["first_training_iterations"], SMALLEST_AGENT["training_iterations"],
+    ]  # fmt: skip
     assert {row.success for row in rows} == {None}
     assert capsys.readouterr().out.count("\nepisode ") == 3
     written = run.write_figures("a title")

@@ -163,7 +163,7 @@ class EnsembleDynamics(Learner[_Fitted]):
             moments, updates = dict[str, _Moments](), 0
         else:
             network, _, moments, updates, _ = self._fitted
-        trained, last_loss = self._train(network, moments, updates, inputs, x, y, generator)
+        trained, last_loss, iterations = self._train(network, moments, updates, inputs, x, y, generator)
 
         @torch.no_grad()
         def predicted(x: Tensor) -> Prediction:
@@ -175,6 +175,7 @@ class EnsembleDynamics(Learner[_Fitted]):
         self._fitted = trained._replace(noise=noise)
         return {
             "loss": last_loss,
+            "iterations": float(iterations),
             "rmse": float((mean.mean(0) - y).square().mean().sqrt()),
             "aleatoric_std": float(torch.exp(0.5 * logvar).mean()),
             "disagreement": float(mean.std(0, correction=0).mean()),
@@ -273,8 +274,8 @@ class EnsembleDynamics(Learner[_Fitted]):
         x: Float[Tensor, "N D"],
         y: Float[Tensor, "N T"],
         generator: torch.Generator,
-    ) -> tuple[_Fitted, float]:
-        """Every member's own bootstrap, shuffled for each epoch; the mean loss of the last epoch that was done."""
+    ) -> tuple[_Fitted, float, int]:
+        """Every member's own bootstrap, shuffled for each epoch; the mean loss of the last one, and the steps made."""
         parameters = {name: value.clone().requires_grad_() for name, value in network.parameters().items()}
         network = Ensemble.from_parameters(parameters)
         # Adam's own decay adds decay * W to the gradient, the gradient of decay / 2 |W|^2, without a pass of its own.
@@ -287,6 +288,7 @@ class EnsembleDynamics(Learner[_Fitted]):
         for name, parameter in parameters.items():
             adam.state[parameter] = adam_memory(parameter, num_updates, moments.get(name))
         learned, held_out = self._split(len(x), generator)
+        before = num_updates
         chosen = torch.randint(len(learned), (self.num_members, len(learned)), generator=generator, device=x.device)
         rows, best = learned[chosen], _Best(math.inf, 0, {}, {}, num_updates)
         for epoch in range(self.num_epochs):
@@ -313,7 +315,8 @@ class EnsembleDynamics(Learner[_Fitted]):
         if held_out is None or not best.parameters:  # no epoch was better than none: its loss was not finite
             best = _Best(math.nan, epoch, *_copies(parameters, adam), num_updates)
         trained = Ensemble.from_parameters(best.parameters)
-        return _Fitted(trained, inputs, best.moments, best.num_updates), float(torch.stack(losses).mean())
+        fitted = _Fitted(trained, inputs, best.moments, best.num_updates)
+        return fitted, float(torch.stack(losses).mean()), num_updates - before
 
     def _split(self, num_rows: int, generator: torch.Generator) -> tuple[Int[Tensor, "n"], Int[Tensor, "h"] | None]:
         """Rows to learn from, and those held out; None where nothing is, for want of patience or of rows."""

@@ -140,7 +140,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         self._fitted = _Fitted(found.model, normalisers, posterior, SeenTargets.of(standardised.y), noise)
         return {
             "bound": found.bound,
-            "evaluations": float(found.num_evaluations),
+            "iterations": float(found.num_iterations),
             "noise_std": float(variance.sqrt().mean()),
             "kernel_std": float(found.model.layers[0].variance.sqrt()),
         } | self._noise_metrics(noise, normalisers[1], variance)

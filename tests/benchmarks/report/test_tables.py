@@ -128,10 +128,13 @@ def test_success():
 
 def test_time():
     runs = grouped(
-        run("A", [1.0] * 3, random=0.0, seconds=60.0, milliseconds=4.0),
+        run("A", [1.0] * 3, random=0.0, seconds=60.0, milliseconds=4.0, cpu_seconds=30.0, iterations=100),
         run("A", [1.0] * 3, random=0.0, seconds=120.0, seed=1, milliseconds=6.0),
         run("B", [1.0] * 4, milliseconds=None),
+        run("C", [1.0] * 2, cpu_seconds=60.0, iterations=7),
+        run("C", [1.0] * 2, seed=1, cpu_seconds=90.0, iterations=8),
     )["Pendulum-v1"]  # fmt: skip
     found = cells(tables.time_table(runs))
-    assert found["A"] == ["2", "6.00 (4.00 to 8.00)", "900.0", "5.00 (4.00 to 6.00)"]
-    assert found["B"] == ["1", "4.00", "600.0", "not measured"]
+    assert found["A"] == ["2", "6.00 (4.00 to 8.00)", "2.00", "400.0", "900.0", "5.00 (4.00 to 6.00)"]
+    assert found["B"] == ["1", "4.00", "not measured", "not measured", "600.0", "not measured"]
+    assert found["C"][2:4] == ["2.50 (2.00 to 3.00)", "15.00 (14.00 to 16.00)"]
