@@ -9,12 +9,14 @@ if TYPE_CHECKING:
     from gym_dgpmpc.agents import GPMPCAgent as GPMPCAgent
     from gym_dgpmpc.agents import MPCAgent as MPCAgent
     from gym_dgpmpc.agents import PETSAgent as PETSAgent
+    from gym_dgpmpc.agents.presets import settings_for as settings_for
     from gym_dgpmpc.envs.registration import *  # noqa: F403
     from gym_dgpmpc.wrappers import RiskSensitiveReward as RiskSensitiveReward
 
 # Public name -> the module it is imported from on first use, so that `import gym_dgpmpc` stays light.
 _MODULE_OF = {
     **dict.fromkeys(("DGPMPCAgent", "GPMPCAgent", "MPCAgent", "PETSAgent"), "gym_dgpmpc.agents"),
+    "settings_for": "gym_dgpmpc.agents.presets",
     "RiskSensitiveReward": "gym_dgpmpc.wrappers",
     **CLASSES,
 }

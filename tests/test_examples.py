@@ -1,6 +1,5 @@
 """The examples run, at a tiny size."""
 
-import functools
 import math
 import re
 from pathlib import Path
@@ -11,7 +10,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from examples import own_task, quickstart
-from gym_dgpmpc import DGPMPCAgent
+from gym_dgpmpc import settings_for
 
 ROOT = Path(own_task.__file__).parents[1]
 TINY = {
@@ -23,6 +22,7 @@ TINY = {
     "sample_spacing": 1,
     "resample_samples": 1,
     "num_candidates": 10,
+    "num_elites": 2,
     "num_iterations": 1,
     "horizon": 2,
     "num_particles": 2,
@@ -56,7 +56,7 @@ def test_the_readmes_lines_run(tmp_path, monkeypatch):
     (code,) = python_of("README.md")
     assert len([line for line in code.splitlines() if line]) <= 6
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gym_dgpmpc.DGPMPCAgent", functools.partial(DGPMPCAgent, **TINY), raising=False)
+    monkeypatch.setattr("gym_dgpmpc.settings_for", lambda env_id: {**settings_for(env_id), **TINY}, raising=False)
     namespace = {}
     exec(code.replace("total_timesteps=1_400", "total_timesteps=30"), namespace)
     assert namespace["agent"].num_timesteps == 30

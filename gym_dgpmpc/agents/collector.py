@@ -4,7 +4,7 @@
 """
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -110,6 +110,11 @@ class Collector:
         running.carried = self._controller.cold
         running.record = EpisodeRecord(number, self._controller.horizon)
         running.index = next_episode(self.store, others)
+
+    def add_training(self, metrics: Mapping[str, float]) -> None:
+        """Count a training among what the running episodes cost; ``metrics`` are those of `DynamicsModel.fit`."""
+        for record in self.records:
+            record.training_iterations += int(metrics.get("iterations", 0))
 
     def end_episode(self, index: int, number: int) -> EpisodeRecord:
         """The record of the episode that has ended in the environment ``index``."""

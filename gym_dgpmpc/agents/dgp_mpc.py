@@ -13,7 +13,8 @@ class DGPMPCAgent(MPCAgent):
         agent = DGPMPCAgent("ModCartPole-v0", seed=0, verbose=1)
         agent.learn(total_timesteps=2_000)
 
-    The paper's settings of a task are in `presets.PAPER`: ``DGPMPCAgent(env, **PAPER["ModCartPole-v0"])``.
+    The best known settings of a task are ``DGPMPCAgent(env, **settings_for("ModCartPole-v0"))``, the paper's
+    are in `presets.PAPER`.
 
     Raises:
         ValueError: an argument is out of its range, or the environment is one that cannot be planned for.

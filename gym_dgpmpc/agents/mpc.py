@@ -730,10 +730,8 @@ class MPCAgent(BaseAlgorithm):
         with self._training_context(), self._bars.training(self.dynamics) as losses:
             metrics = dict(self.dynamics.fit(task.transitions(self.store), self.generators.fit))
         self.num_fitted = len(self.store)
-        for record in self.episode_records:
-            record.training_iterations += int(metrics.get("iterations", 0))
-        if losses:
-            metrics |= {"first_loss": losses[0], "last_loss": losses[-1]}
+        self.collector.add_training(metrics)
+        metrics |= {"first_loss": losses[0], "last_loss": losses[-1]} if losses else {}
         metrics |= {"num_transitions": self.num_fitted, "seconds": time.perf_counter() - started}
         for name, value in metrics.items():
             self.logger.record(f"train/{name}", value)
