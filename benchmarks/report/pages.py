@@ -7,11 +7,12 @@ from pathlib import Path
 from benchmarks import paper
 from benchmarks.report import charts, scores, tables
 from benchmarks.report.curves import MOST_POINTS
-from benchmarks.report.markdown import page_and_folder
+from benchmarks.report.markdown import number, page_and_folder
 from benchmarks.report.provenance import Origins
 from benchmarks.report.scores import CEILING, Runs
 from benchmarks.report.statistics import CONFIDENCE, RESAMPLES
 from benchmarks.result_files import ResultError
+from benchmarks.tasks import TASKS
 from gym_dgpmpc.checkpoints.files import replace_text
 
 LEGEND = (
@@ -133,7 +134,8 @@ def _add_overview(page: _Page, study: Mapping[str, Runs], references: Mapping[st
             page.table(
                 lines, {task: study[task] for task in over},  # every run of a task has its part in the scale
                 f"Mean return at equal steps over {', '.join(over)}, scaled per task: 0 is what random actions earn in "
-                "the first episodes of all its runs, 1 what the planner with the true dynamics does.",
+                f"the first episodes of all its runs{_but_for_the_idle(over)}, 1 what the planner with the true "
+                "dynamics does.",
             )  # fmt: skip
     settings = {
         task: [method for method in study[task] if scores.setting_of(method) in cells]
@@ -212,6 +214,15 @@ def _only(study: Mapping[str, Runs], methods: Mapping[str, Sequence[str]], *more
         task: {method: study[task][method] for method in [*named, *more] if method in study[task]}
         for task, named in methods.items()
     }
+
+
+def _but_for_the_idle(tasks: Sequence[str]) -> str:
+    """What counts as 0 where that is not what random actions earn."""
+    idle = {task: TASKS[task].idle_return for task in tasks if task in TASKS}
+    said = [
+        f"on {task} what doing nothing does, {number(value, 1)}" for task, value in idle.items() if value is not None
+    ]
+    return f" ({', '.join(said)})" if said else ""
 
 
 def _curve_caption(what: str) -> str:

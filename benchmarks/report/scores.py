@@ -13,6 +13,7 @@ from numpy import ndarray
 
 from benchmarks import paper
 from benchmarks.result_files import Episode, ResultError, RunResult, read_results
+from benchmarks.tasks import TASKS
 
 OURS = "DGP-MPC"
 """What the names of the package's own method begin with; its settings follow."""
@@ -176,9 +177,13 @@ def ceiling_return(runs: Runs) -> float | None:
     return float(mean_returns(runs[CEILING]).mean()) if CEILING in runs else None
 
 
-def scale_of(runs: Runs) -> tuple[float, float] | None:
-    """The returns that count as 0 and as 1: of random actions and of the ceiling; None unless both are known."""
-    low, high = random_return(runs), ceiling_return(runs)
+def scale_of(task: str, runs: Runs) -> tuple[float, float] | None:
+    """The returns that count as 0 and as 1: of random actions and of the ceiling; None unless both are known.
+
+    Where a task has an ``idle_return``, that of doing nothing counts as 0.
+    """
+    idle = TASKS[task].idle_return if task in TASKS else None
+    low, high = random_return(runs) if idle is None else idle, ceiling_return(runs)
     return None if low is None or high is None or high <= low else (low, high)
 
 
@@ -199,7 +204,7 @@ def threshold_of(task: str, runs: Runs, given: Mapping[str, float]) -> Threshold
         registered = None
     if registered is not None:
         return Threshold(float(registered), "its reward threshold in Gymnasium")
-    scale = scale_of(runs)
+    scale = scale_of(task, runs)
     if scale is None:
         return None
     origin = f"{NEAR:.0%} of the way from random actions to the ceiling"

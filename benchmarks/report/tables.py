@@ -115,14 +115,14 @@ def overall_improvement_table(study: Mapping[str, Runs], references: Mapping[str
 
 
 def aggregate_tables(study: Mapping[str, Runs], reference: Mapping[str, str]) -> dict[tuple[str, ...], list[str]]:
-    """Returns on the scale from random actions, 0, to the ceiling, 1, over every set of tasks that some method has.
+    """Returns on the scale of `scores.scale_of` over every set of tasks that some method has.
 
     Each table is over one set of tasks and holds the methods that have all of them; a reference that differs between
     tasks counts as one method.
     """
     by_method: dict[str, dict[str, Float[ndarray, " n"]]] = {}
     for task, runs in study.items():
-        scale = scores.scale_of(runs)
+        scale = scores.scale_of(task, runs)
         if scale is None:
             continue
         _, returns = at_equal_steps(runs)

@@ -9,6 +9,7 @@ import pytest
 from benchmarks import paper
 from benchmarks.report import scores
 from benchmarks.result_files import ResultError
+from benchmarks.tasks import TASKS
 from tests.benchmarks.made_up import grouped, run
 
 
@@ -117,10 +118,23 @@ def test_scale_goes_from_random_actions_to_the_ceiling():
         run("A", [1.0], random=-4.0), run("B", [1.0], random=-6.0), run("true dynamics", [8.0, 10.0]),
         run("true dynamics", [11.0], seed=1),
     )["Pendulum-v1"]  # fmt: skip
-    assert scores.scale_of(runs) == (-5.0, 10.0)
-    assert scores.scale_of({"A": runs["A"]}) is None
-    assert scores.scale_of({"true dynamics": runs["true dynamics"]}) is None
-    assert scores.scale_of({"true dynamics": [run("true dynamics", [1.0], random=2.0)]}) is None
+    assert scores.scale_of("Pendulum-v1", runs) == (-5.0, 10.0)
+    assert scores.scale_of("Pendulum-v1", {"A": runs["A"]}) is None
+    assert scores.scale_of("Pendulum-v1", {"true dynamics": runs["true dynamics"]}) is None
+    assert scores.scale_of("Pendulum-v1", {"true dynamics": [run("true dynamics", [1.0], random=2.0)]}) is None
+
+
+def test_the_reachers_scale_begins_with_doing_nothing():
+    """Recomputed here: the mean of the fifteen episodes after the first, which no seed changes."""
+    task = TASKS["BiasedReacher-v0"]
+    env, returns = task.make(), []
+    for _ in range(16):
+        env.reset(seed=None if returns else 3)
+        steps = (env.step(np.zeros(env.action_space.shape, np.float32)) for _ in range(task.episode_steps))
+        returns.append(sum(reward for _, reward, *_ in steps))
+    assert task.idle_return == pytest.approx(np.mean(returns[1:]), abs=1e-3)
+    runs = grouped(run("A", [-40.0], random=-1400.0), run("true dynamics", [-30.0]))["Pendulum-v1"]
+    assert scores.scale_of("BiasedReacher-v0", runs) == (task.idle_return, -30.0)
 
 
 def test_threshold_comes_from_the_first_source_that_has_one():
