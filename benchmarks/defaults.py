@@ -1,4 +1,4 @@
-"""Whether a default may change: `python -m benchmarks.defaults VARIANT ...`, the protocol of docs/benchmarks.md.
+"""Whether a default may change: `python -m benchmarks.defaults VARIANT ...`, the protocol of docs/planning.md.
 
 A variant is given by its settings, "kernel=rbf,planner=icem"; the present defaults are measured beside the variants.
 All pass three stages: forecasts of recorded episodes, the first five planned episodes of the cart-pole, and the first
