@@ -19,7 +19,6 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from benchmarks.tasks import Task
 from gym_dgpmpc.agents import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent, presets
-from gym_dgpmpc.agents.exploration import ExplorationName
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.planning import PLANNERS, planner_factory
@@ -79,9 +78,11 @@ class PlanningMethod:
             ValueError: the agent has no argument of a name that is asked for.
         """
         given = {**self.presets(task), **self.fixed, **task.for_planning}
-        mine = settings_of(planner_factory({"planner": "cem", **given, **asked}["planner"]))
+        defaults, planner = _defaults(self.make_agent), {**given, **asked}.get("planner", "cem")
+        mine = settings_of(planner_factory(planner))
         of_others = {name for other in PLANNERS for name in settings_of(planner_factory(other))} - set(mine)
-        defaults = {**{name: setting.default for name, setting in mine.items()}, **_defaults(self.make_agent)}
+        if planner != "cem":  # whose settings the agents' signatures have
+            defaults = {**{name: setting.default for name, setting in mine.items()}, **defaults}
         defaults, given = (
             {name: value for name, value in settings.items() if name not in of_others} for settings in (defaults, given)
         )
@@ -136,18 +137,15 @@ Method = PlanningMethod | ModelFreeMethod
 def true_dynamics_agent(
     env: gymnasium.Env,
     *,
-    planner: str = "cem",
     horizon: int = 30,
     num_candidates: int = 300,
     num_elites: int | None = None,
     num_iterations: int = 5,
     actions_per_plan: int = 1,
-    exploration: ExplorationName = "uniform",
     learning_starts: int | None = None,
     seed: int | None = None,
     verbose: int = 0,
     tensorboard_log: str | None = None,
-    **of_planner: Any,
 ) -> MPCAgent:
     """An agent that plans with the simulator itself, in one world.
 
@@ -160,19 +158,16 @@ def true_dynamics_agent(
     return MPCAgent(
         env,
         TrueDynamics(env),
-        planner=planner,
         horizon=horizon,
         num_candidates=num_candidates,
         num_elites=num_elites,
         num_iterations=num_iterations,
         num_particles=1,
         actions_per_plan=actions_per_plan,
-        exploration=exploration,
         learning_starts=learning_starts,
         seed=seed,
         verbose=verbose,
         tensorboard_log=tensorboard_log,
-        **of_planner,
     )
 
 
@@ -187,15 +182,17 @@ def random_steps(task: Task) -> int:
 
 
 def _planning(task: Task) -> Mapping[str, Any]:
-    """The paper's settings on its tasks, this package's own on Gymnasium's, no settings on others."""
-    return presets.settings_for(task.preset)
+    """The paper's settings on its tasks, this package's own on Gymnasium's, and the model's.
+
+    Not `presets.PLANNING`: beside the paper, and beside rivals as published, all methods plan and explore as the paper
+    does. A suite may ask for it, for every method alike.
+    """
+    return _of(presets.PAPER, presets.STOCK, presets.DEEP_GP)(task)
 
 
 def _planning_alone(task: Task) -> Mapping[str, Any]:
-    settings = _planning(task)
-    of_planner = settings_of(planner_factory(settings.get("planner", "cem")))
-    names = {*inspect.signature(true_dynamics_agent).parameters, *of_planner}
-    return {name: value for name, value in settings.items() if name in names}
+    names = inspect.signature(true_dynamics_agent).parameters
+    return {name: value for name, value in _planning(task).items() if name in names}
 
 
 def _off_policy(task: Task) -> Mapping[str, Any]:
@@ -241,21 +238,13 @@ ALL_METHODS: tuple[Method, ...] = (
     PlanningMethod(
         "PETS TSinf to its optimum",
         PETSAgent,
-        _of(presets.COMPARISON_PETS, presets.PLANNING),
+        _of(presets.COMPARISON_PETS),
         {"draw": "TSinf", **OPTIMUM, **_FASTER},
     ),
     *(
-        PlanningMethod(f"GP-{draw}", GPMPCAgent, _of(presets.COMPARISON_GP), {"draw": draw, "add_noise": False})
+        PlanningMethod(f"GP-{draw}{name}", GPMPCAgent, _of(presets.COMPARISON_GP), {"draw": draw, "add_noise": noise})
         for draw in ("MM", "DS")
-    ),
-    *(
-        PlanningMethod(
-            f"GP-{draw} with noise",
-            GPMPCAgent,
-            _of(presets.COMPARISON_GP, presets.PLANNING),
-            {"draw": draw, "add_noise": True},
-        )
-        for draw in ("MM", "DS")
+        for name, noise in (("", False), (" with noise", True))
     ),
     PlanningMethod("true dynamics", true_dynamics_agent, _planning_alone),
     ModelFreeMethod("SAC", SAC, _off_policy),

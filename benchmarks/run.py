@@ -21,6 +21,7 @@ from benchmarks.methods import METHODS, ModelFreeMethod, PlanningMethod, Setting
 from benchmarks.result_files import Actions, Episode, RunKey, RunResult
 from benchmarks.tasks import Task
 from gym_dgpmpc.errors import DGPMPCError, RunInUseError
+from gym_dgpmpc.planning import PLANNERS
 from gym_dgpmpc.runs.folder import EPISODES_FILE, EpisodeRow, RunFolder, read_rows
 from gym_dgpmpc.runs.provenance import machine, revision, versions
 from gym_dgpmpc.runs.recording import EpisodeRecorder
@@ -90,6 +91,11 @@ class Run:
         """Every argument of the method."""
         return METHODS[self.method].settings(self.task, **self.asked)
 
+    def _own_settings(self, made_with: Mapping[str, Any]) -> Settings:
+        """The method's on this task, by the planner that ``made_with`` names, if any: no other one's settings count."""
+        planner = {name: value for name, value in made_with.items() if name == "planner" and value in PLANNERS}
+        return METHODS[self.method].settings(self.task, **planner)
+
     @property
     def max_steps(self) -> int:
         """Environment steps after which the run ends, in however many episodes."""
@@ -134,7 +140,7 @@ class Run:
             OtherRunError: some settings differ; the message names them.
         """
         wanted = _as_in_files(self.settings)
-        made_with = _as_in_files(METHODS[self.method].settings(self.task)) | dict(result.settings)
+        made_with = _as_in_files(self._own_settings(result.settings)) | dict(result.settings)
         differing = [
             f"{name} was {made_with[name]}, now {wanted.get(name, 'there is no such setting')}"
             for name in sorted(made_with)
@@ -177,7 +183,7 @@ class Run:
         settings = self.settings
         identity = {"environment": self.task.name, "method": self.method, **settings, "seed": self.seed}
         advice = f"choose another folder for unfinished runs, or delete {self._folder(folders.work)}"
-        before = method.settings(self.task)  # what a run counts as that is older than a setting
+        before = self._own_settings(settings)  # what a run counts as that is older than a setting
         open_folder = partial(RunFolder, self._folder(folders.work), identity, defaults=before, otherwise=advice)
         with closing(self.task.make()) as env, closing(_patiently(open_folder)) as folder:
             run = TrainingRun(

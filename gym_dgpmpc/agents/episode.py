@@ -28,7 +28,7 @@ class EpisodeRecord:
         self.number, self.horizon = number, horizon
         self._started, self._cpu_started = time.perf_counter(), time.process_time()
         self.training_iterations = 0
-        """Steps of the optimiser, or of the sampler, in the trainings since the episode began."""
+        """Of the trainings since the episode began, in the model's own count; samples taken after them not included."""
         self.rewards: list[float] = []
         self.plans: list[PlanInfo] = []
         self.plan_steps: list[int] = []

@@ -315,3 +315,16 @@ def test_model_free_methods_learn_of_the_risk_that_planners_plan_with(name):
         assert env.get_wrapper_attr("plans_with_another_reward") != is_model_free
         env.close()
     assert METHODS["SAC"].settings(task)["penalise_step"]
+
+
+def test_a_run_by_another_planner_goes_on_and_is_not_done_twice(folders, tmp_path):
+    """Settings of the method's own planner, which it lacks, are none that it could differ in."""
+    run = tiny(
+        DGP, toy(diary=str(tmp_path / "diary"), ends_at=30, end="interrupt"), episodes=3, asked={"planner": "icem"}
+    )
+    with pytest.raises(KeyboardInterrupt):
+        run.perform(folders)
+    run.perform(folders)
+    assert run.is_finished(folders.results)
+    with pytest.raises(OtherRunError, match="planner was icem, now cem"):
+        tiny(DGP, episodes=3).is_finished(folders.results)

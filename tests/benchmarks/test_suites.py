@@ -11,9 +11,9 @@ import pytest
 from benchmarks.methods import METHODS
 from benchmarks.paper import EPISODES as PAPER_TASKS
 from benchmarks.paper import KERNELS
-from benchmarks.suites import SUITES, Selection, SuiteError, find_suite
+from benchmarks.suites import AT_THEIR_BEST, SUITES, Selection, SuiteError, find_suite
 from benchmarks.tasks import TASKS
-from gym_dgpmpc.agents.presets import COMPARISON_PETS, PAPER, PETS
+from gym_dgpmpc.agents.presets import COMPARISON_PETS, PAPER, PETS, PLANNING
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 RUN_SUITES = ("table", "comparison", "variance", "unmodified", "long-cheetah", "stock")
@@ -146,3 +146,22 @@ def test_what_a_suite_does_not_have(suite, selection, message):
 def test_results_are_found_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert [SUITES[name].results for name in ("table", "contact")] == [RESULTS / "runs", RESULTS / "contact"]
+
+
+def test_all_that_are_at_their_best_plan_alike_and_the_others_as_the_paper():
+    runs = jobs("fair", seeds=[20], tasks=["ModCartPole-v0"])
+    planners = {run.method: run.settings["planner"] for run in runs if not METHODS[run.method].is_model_free}
+    better = {name for name, planner in planners.items() if planner == "icem"}
+    assert better == AT_THEIR_BEST and set(planners) - better == {"PETS TSinf", "GP-MM"}
+    for run in runs:
+        if run.method in better:
+            assert run.settings == {**run.settings, **PLANNING["ModCartPole-v0"]}
+    for name in ("table", "comparison", "variance", "unmodified"):
+        others = jobs(name, seeds=[0])
+        assert {run.settings.get("planner", "cem") for run in others} == {"cem"}
+
+
+def test_the_committed_fair_runs_are_those_of_the_suite():
+    fair = find_suite("fair")
+    done = [run for run in fair.jobs(Selection(tasks=["ModCartPole-v0"])) if run.is_finished(fair.results)]
+    assert len(done) >= 20 and {run.method for run in done} <= AT_THEIR_BEST | {"PETS TSinf", "GP-MM"}
