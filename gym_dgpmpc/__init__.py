@@ -6,17 +6,20 @@ from gym_dgpmpc.envs.registration import CLASSES, import_public, register_enviro
 
 if TYPE_CHECKING:
     from gym_dgpmpc.agents import DGPMPCAgent as DGPMPCAgent
+    from gym_dgpmpc.agents import DynaAgent as DynaAgent
     from gym_dgpmpc.agents import GPMPCAgent as GPMPCAgent
     from gym_dgpmpc.agents import MPCAgent as MPCAgent
     from gym_dgpmpc.agents import PETSAgent as PETSAgent
     from gym_dgpmpc.agents.presets import settings_for as settings_for
     from gym_dgpmpc.envs.registration import *  # noqa: F403
+    from gym_dgpmpc.imagination import ImaginedVecEnv as ImaginedVecEnv
     from gym_dgpmpc.wrappers import RiskSensitiveReward as RiskSensitiveReward
 
 # Public name -> the module it is imported from on first use, so that `import gym_dgpmpc` stays light.
 _MODULE_OF = {
-    **dict.fromkeys(("DGPMPCAgent", "GPMPCAgent", "MPCAgent", "PETSAgent"), "gym_dgpmpc.agents"),
+    **dict.fromkeys(("DGPMPCAgent", "DynaAgent", "GPMPCAgent", "MPCAgent", "PETSAgent"), "gym_dgpmpc.agents"),
     "settings_for": "gym_dgpmpc.agents.presets",
+    "ImaginedVecEnv": "gym_dgpmpc.imagination",
     "RiskSensitiveReward": "gym_dgpmpc.wrappers",
     **CLASSES,
 }

@@ -41,7 +41,14 @@ class Generators(NamedTuple):
             generator.set_state(state[name])
 
 
-STREAMS = (*Generators._fields, "deterministic_prediction", "environment", "forecast", "other_device")
+STREAMS = (
+    *Generators._fields,
+    "deterministic_prediction",
+    "environment",
+    "forecast",
+    "other_device",
+    "imagination",
+)
 
 
 def derive_seed(seed: int, stream: str, *key: int) -> int:

@@ -1,8 +1,9 @@
 """The agents: model-predictive control as Stable-Baselines3 algorithms, and the named methods made of its parts."""
 
 from gym_dgpmpc.agents.dgp_mpc import DGPMPCAgent
+from gym_dgpmpc.agents.dyna import DynaAgent
 from gym_dgpmpc.agents.gp_mpc import GPMPCAgent
 from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.agents.pets import PETSAgent
 
-__all__ = ["DGPMPCAgent", "GPMPCAgent", "MPCAgent", "PETSAgent"]
+__all__ = ["DGPMPCAgent", "DynaAgent", "GPMPCAgent", "MPCAgent", "PETSAgent"]

@@ -1,4 +1,4 @@
-"""What an agent is made of: a dynamics model and a planner, each with the settings that its own class documents.
+"""What an agent is made of: dynamics model, planner and controller, each with the settings that its class documents.
 
 `MPCAgent` keeps a `Composition` of what it was asked for; `signature.py` shows the same to `help` and to callers.
 """
@@ -13,6 +13,7 @@ import torch
 from gymnasium import spaces
 
 from gym_dgpmpc.agents.signature import PLAIN
+from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.registry import PlannerName, is_ready_made, make_planner, planner_factory
 from gym_dgpmpc.planning.risk import RiskMeasure
 from gym_dgpmpc.settings import Setting, joined, refuse_unknown, settings_of
@@ -38,11 +39,13 @@ class MadeOf(NamedTuple):
         name: of the class.
         dynamics_class: the model that it makes, or None if it is given one.
         planner_defaults: the planner's settings that differ from the planner's own defaults.
+        controller_class: what acts through model and planner.
     """
 
     name: str
     dynamics_class: Callable[..., DynamicsModel] | None
     planner_defaults: Mapping[str, Any]
+    controller_class: type[Controller] = Controller
 
 
 def own_settings(base: Callable[..., Any], agent: type) -> dict[str, Setting]:
@@ -61,9 +64,9 @@ def own_settings(base: Callable[..., Any], agent: type) -> dict[str, Setting]:
 
 
 def part_settings(agent: MadeOf, planner: AnyPlanner) -> dict[str, Setting]:
-    """The settings of an agent's model, and of its planner unless that is a ready-made one."""
+    """The settings of an agent's model and controller, and of its planner unless that is a ready-made one."""
     of_planner = {} if is_ready_made(planner) else settings_of(planner_factory(planner))
-    return joined(model_settings(agent), of_planner)
+    return joined(model_settings(agent), settings_of(agent.controller_class), of_planner)
 
 
 def model_settings(agent: MadeOf) -> dict[str, Setting]:
@@ -102,11 +105,11 @@ class Composition:
     Args:
         agent: what its class says.
         dynamics, planner: as they were given to it.
-        settings: those of model and planner that were given.
-        other_names: arguments that are no settings of these two, for the error.
+        settings: those of model, planner and controller that were given.
+        other_names: arguments that are no settings of these, for the error.
 
     Attributes:
-        settings: every setting of model and planner, the defaults where none was given; fixed from then on.
+        settings: every setting of model, planner and controller, the defaults where none was given; fixed from then on.
 
     Raises:
         TypeError: there is no such setting; or a model was given to an agent that makes its own.
@@ -151,9 +154,25 @@ class Composition:
         Raises:
             ValueError, TypeError: see `registry.make_planner`.
         """
-        of_model = model_settings(self._agent)
-        own = {name: value for name, value in self.settings.items() if name not in of_model}
+        of_others = {**model_settings(self._agent), **settings_of(self._agent.controller_class)}
+        own = {name: value for name, value in self.settings.items() if name not in of_others}
         return make_planner(self.planner, action_space, device, **own)
+
+    def make_controller(
+        self,
+        dynamics: DynamicsModel,
+        action_space: spaces.Box,
+        planning: PlanningArguments,
+        device: torch.device,
+    ) -> Controller:
+        """The controller of an untrained model, with a planner of its own.
+
+        Raises:
+            ValueError, TypeError: see `registry.make_planner` and the class of the controller.
+        """
+        own = {name: self.settings[name] for name in settings_of(self._agent.controller_class)}
+        planner = self.make_planner(action_space, device)
+        return self._agent.controller_class(dynamics, planner, action_space, *planning, **own, device=device)
 
     def make_dynamics(
         self, observation_size: int, action_size: int, observation_spec: ObservationSpec, device: torch.device

@@ -1,4 +1,5 @@
-"""The actions before there is a model to plan with: random ones of several kinds, or the user's own controller's.
+"""The actions before there is a model to plan with: random ones of several kinds, or the user's own controller's; and
+when there have been enough of them.
 
 Independent random actions average out: over some steps a plant hardly moves. Held, coloured and swept ones move it
 further, and show the model states that plans will lead to. All but the uniform ones, which go on from a generator, are
@@ -30,6 +31,12 @@ FirstController = Callable[[Any], Any]
 
 LONGEST = 1000
 """Steps after which noise and sweeps begin anew, where episodes are longer or have no limit."""
+
+ENDLESS = 1000
+"""Random steps after which a warning says that no episode has ended. Gymnasium's own tasks have at most as many."""
+
+MANY_GIVEN_UP = 10
+"""Random episodes given up for new ones, after which a warning says that it may take long until anything is learned."""
 
 QUICKEST = 0.25
 """Cycles per step at which a sweep ends: of each cycle there are four actions, which show that it is one."""
@@ -84,6 +91,46 @@ class Explorer:
                 f"first_controller must be a function of an observation, or None, got {agent.first_controller!r}"
             )
         self._agent = agent
+
+    @property
+    def has_seen_enough(self) -> bool:
+        """Whether there are transitions enough for the first training."""
+        agent = self._agent
+        if agent.learning_starts is not None:
+            return len(agent.store) >= agent.learning_starts
+        # An episode that never ends must not put off the first training beyond the others.
+        is_due = agent.train_freq is not None and len(agent.store) >= agent.train_freq
+        return is_due or agent.collector.all_explored or self._has_explored_in_pieces
+
+    @property
+    def _has_explored_in_pieces(self) -> bool:
+        """Whether there are as many steps as an episode may have, of episodes of which none was let end."""
+        agent = self._agent
+        if agent.collector.num_given_up == 0:
+            return False
+        limit = time_limit(agent.env)
+        return limit is not None and len(agent.store) >= limit * agent.n_envs
+
+    def endless_beginning(self) -> str | None:
+        """What is to be said when exploration goes on for suspiciously long; None if it does not."""
+        agent = self._agent
+        if agent.learning_starts is None and agent.collector.num_given_up > 1:
+            limit = time_limit(agent.env)
+            if limit is None or agent.collector.num_given_up >= MANY_GIVEN_UP:
+                when = "one does" if limit is None else f"one does, or there are {limit * agent.n_envs} random steps"
+                return (
+                    "no episode has ended, because each call of learn begins a new one, and nothing is learned before "
+                    f"{when}: pass reset_num_timesteps=False to learn, which then goes on in the running episode, or "
+                    "learning_starts=... to the agent"
+                )
+        is_late = len(agent.store) == ENDLESS * agent.n_envs and not agent.collector.any_explored
+        if agent.learning_starts is None and is_late:
+            return (
+                f"after {ENDLESS} random steps no episode has ended, and nothing is learned before one does: give the "
+                "environment a time limit (gymnasium.wrappers.TimeLimit), or pass learning_starts=... and, if episodes "
+                "never end, train_freq=..."
+            )
+        return None
 
     def actions(self, observations: Float[np.ndarray, "n S"]) -> Float[np.ndarray, "n A"]:
         """The next action of each environment's running episode.

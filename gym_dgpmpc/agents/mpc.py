@@ -52,6 +52,9 @@ from gym_dgpmpc.checkpoints.safeguard import Guard, safeguard
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
+from gym_dgpmpc.imagination.algorithms import AlgorithmName
+from gym_dgpmpc.imagination.beginnings import StartFunction, StartName
+from gym_dgpmpc.imagination.policies import imagine
 from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.plan_state import PackedPlans
 from gym_dgpmpc.planning.registry import planner_factory
@@ -60,7 +63,7 @@ from gym_dgpmpc.randomness import Generators, fresh_seed, split_seed
 from gym_dgpmpc.settings import Setting, joined, settings_of
 from gym_dgpmpc.tasks.borders import received_batch
 from gym_dgpmpc.tasks.dict_observations import FlatDict, original_space
-from gym_dgpmpc.tasks.environment import flat_size, time_limit, wrapped_env
+from gym_dgpmpc.tasks.environment import flat_size, wrapped_env
 from gym_dgpmpc.tasks.exported import arrays, minari_dataset, replay_buffer
 from gym_dgpmpc.tasks.functions import Learned, Never
 from gym_dgpmpc.tasks.logged import Logged, read_logged
@@ -78,12 +81,6 @@ from gym_dgpmpc.types import (
 )
 
 SelfAgent = TypeVar("SelfAgent", bound="MPCAgent")
-
-ENDLESS = 1000
-"""Random steps after which a warning says that no episode has ended. Gymnasium's own tasks have at most as many."""
-
-MANY_GIVEN_UP = 10
-"""Random episodes given up for new ones, after which a warning says that it may take long until anything is learned."""
 
 
 class MPCAgent(BaseAlgorithm):
@@ -162,6 +159,8 @@ class MPCAgent(BaseAlgorithm):
 
     dynamics_class: ClassVar[Callable[..., DynamicsModel] | None] = None
     """Of a named agent, the model that it is made of; its settings are arguments of the agent."""
+    controller_class: ClassVar[type[Controller]] = Controller
+    """What acts through model and planner; its settings are arguments of the agent."""
     planner_defaults: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     """Of a named agent, the planner's settings that differ from the planner's own defaults."""
     largest: ClassVar[Mapping[str, int]] = MappingProxyType({"num_particles": 10**4})
@@ -171,7 +170,8 @@ class MPCAgent(BaseAlgorithm):
         """A named agent's signature and documentation are made of those of its parts."""
         super().__init_subclass__(**kwargs)
         if cls.dynamics_class is not None:
-            parts = (cls.own_settings(), settings_of(cls.dynamics_class), settings_of(planner_factory("cem")))
+            of_parts = (settings_of(cls.dynamics_class), settings_of(cls.controller_class))
+            parts = (cls.own_settings(), *of_parts, settings_of(planner_factory("cem")))
             cls.__signature__ = composed_signature(cls, *parts)  # type: ignore[attr-defined]
             cls.__doc__ = composed_documentation(cls, *parts)
             for name in joined(*parts[1:]):
@@ -247,7 +247,7 @@ class MPCAgent(BaseAlgorithm):
     @classmethod
     def made_of(cls) -> MadeOf:
         """What this class says of its parts."""
-        return MadeOf(cls.__name__, cls.dynamics_class, cls.planner_defaults)
+        return MadeOf(cls.__name__, cls.dynamics_class, cls.planner_defaults, cls.controller_class)
 
     @classmethod
     def own_settings(cls) -> dict[str, Setting]:
@@ -256,7 +256,7 @@ class MPCAgent(BaseAlgorithm):
 
     @classmethod
     def part_settings(cls, planner: AnyPlanner = "cem") -> dict[str, Setting]:
-        """The settings of the model, and of the planner unless it is a ready-made one."""
+        """The settings of model and controller, and of the planner unless it is a ready-made one."""
         return part_settings(cls.made_of(), planner)
 
     @classmethod
@@ -267,7 +267,7 @@ class MPCAgent(BaseAlgorithm):
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """Every setting of model and planner; each can be read as an attribute too, and none can be changed."""
+        """Every setting of model, planner and controller; each can be read as an attribute too, none can be changed."""
         return self.composition.settings
 
     def _setup_model(self) -> None:
@@ -279,10 +279,9 @@ class MPCAgent(BaseAlgorithm):
         )
         self.generators: Generators = split_seed(self.seed, self.device)
         self.task = Task(self.env, self.observation_space, self.action_space, self._task_given, self.device)
-        planner = self.composition.make_planner(self.action_space, self.device)
         self.num_fitted = 0  # transitions that the last training saw
-        self.controller = Controller(
-            self._new_dynamics(), planner, self.action_space, *self._planning_given, device=self.device
+        self.controller = self.composition.make_controller(
+            self._new_dynamics(), self.action_space, self._planning_given, self.device
         )
         self.collector = Collector(self.store, self.n_envs, self.controller)
         self.explorer = Explorer(self)
@@ -372,21 +371,7 @@ class MPCAgent(BaseAlgorithm):
     @property
     def is_exploring(self) -> bool:
         """Whether the next actions are random because there are too few transitions to learn from."""
-        if self.is_fitted:
-            return False
-        if self.learning_starts is None:
-            # An episode that never ends must not put off the first training beyond the others.
-            enough = self.train_freq is not None and len(self.store) >= self.train_freq
-            return not enough and not self.collector.all_explored and not self._has_explored_in_pieces
-        return len(self.store) < self.learning_starts
-
-    @property
-    def _has_explored_in_pieces(self) -> bool:
-        """Whether there are as many steps as an episode may have, of episodes of which none was let end."""
-        if self.collector.num_given_up == 0:
-            return False
-        limit = time_limit(self.env)
-        return limit is not None and len(self.store) >= limit * self.n_envs
+        return not self.is_fitted and not self.explorer.has_seen_enough
 
     @property
     def is_training_due(self) -> bool:
@@ -621,7 +606,8 @@ class MPCAgent(BaseAlgorithm):
             # Sample K action sequences and P trajectories of each, update m and v by their returns, repeat.
             observations = self._observations
             if self.is_exploring:
-                self._warn_of_an_endless_beginning()
+                if (warning := self.explorer.endless_beginning()) is not None:
+                    self._warn_once(warning)
                 actions = self.explorer.actions(observations)
             else:
                 actions = self._plan(observations)
@@ -685,24 +671,6 @@ class MPCAgent(BaseAlgorithm):
             )
         return new_obs, rewards, dones, infos
 
-    def _warn_of_an_endless_beginning(self) -> None:
-        if self.learning_starts is None and self.collector.num_given_up > 1:
-            limit = time_limit(self.env)
-            if limit is None or self.collector.num_given_up >= MANY_GIVEN_UP:
-                when = "one does" if limit is None else f"one does, or there are {limit * self.n_envs} random steps"
-                self._warn_once(
-                    "no episode has ended, because each call of learn begins a new one, and nothing is learned before "
-                    f"{when}: pass reset_num_timesteps=False to learn, which then goes on in the running episode, or "
-                    "learning_starts=... to the agent"
-                )
-        is_late = len(self.store) == ENDLESS * self.n_envs and not self.collector.any_explored
-        if self.learning_starts is None and is_late:
-            self._warn_once(
-                f"after {ENDLESS} random steps no episode has ended, and nothing is learned before one does: give the "
-                "environment a time limit (gymnasium.wrappers.TimeLimit), or pass learning_starts=... and, if episodes "
-                "never end, train_freq=..."
-            )
-
     def _begin_episode(self, index: int, callback: BaseCallback) -> None:
         """A new episode starts with a cold plan."""
         received = self._observations[index]
@@ -730,11 +698,16 @@ class MPCAgent(BaseAlgorithm):
         with self._training_context(), self._bars.training(self.dynamics) as losses:
             metrics = dict(self.dynamics.fit(task.transitions(self.store), self.generators.fit))
         self.num_fitted = len(self.store)
+        metrics |= self._improve()
         self.collector.add_training(metrics)
         metrics |= {"first_loss": losses[0], "last_loss": losses[-1]} if losses else {}
         metrics |= {"num_transitions": self.num_fitted, "seconds": time.perf_counter() - started}
         for name, value in metrics.items():
             self.logger.record(f"train/{name}", value)
+
+    def _improve(self) -> Mapping[str, float]:
+        """What an agent learns beside its model, once that is trained; returns metrics to log."""
+        return {}
 
     def _end_episode(self, index: int, callback: BaseCallback, log_interval: int) -> None:
         """Count, log and print what happened."""
@@ -774,6 +747,62 @@ class MPCAgent(BaseAlgorithm):
         if message not in self._warned:
             self._warned.add(message)
             warnings.warn(message, stacklevel=3)
+
+    # -------------------------------------------------------------------------------------------------- imagining
+
+    def imagine_policy(
+        self,
+        algorithm: AlgorithmName | type[BaseAlgorithm] = "SAC",
+        total_timesteps: int = 100_000,
+        *,
+        num_worlds: int = 20,
+        episode_steps: int | None = None,
+        starts: StartName | StartFunction = "mixed",
+        trial_every: int = 5_000,
+        patience: int = 6,
+        seed: int | None = None,
+        progress_bar: bool = False,
+        **settings: Any,
+    ) -> BaseAlgorithm:
+        """Train a policy in worlds drawn from the model; it acts by itself, in a fraction of a millisecond.
+
+            policy = agent.imagine_policy("SAC", progress_bar=True)
+            policy.save("policy.zip")  # a file of Stable-Baselines3's: SAC.load needs nothing of this package
+
+        The policy is tried every ``trial_every`` imagined steps in worlds that it never learns in. The best one is
+        returned, and training ends once ``patience`` trials have brought no better one. The environment is not asked.
+        `imagination.policies.imagine` does the same, and returns all trials too.
+
+        Args:
+            algorithm: "SAC", "TD3", "DDPG", "PPO" or "A2C"; "TQC" or "CrossQ" where sb3-contrib is installed; or the
+                class of another one of Stable-Baselines3's.
+            total_timesteps: imagined steps to learn from, at most.
+            num_worlds: worlds side by side.
+            episode_steps: steps of an imagined episode; None: the environment's time limit, or 200 if that is less.
+            starts: where imagined episodes begin: at "starts", the first observations of recorded episodes; at
+                "states", any recorded observation; "mixed", at either with equal chances; or a function (n, NumPy
+                generator) -> observations [n, S].
+            trial_every: imagined steps between two trials.
+            patience: trials without a better one after which training ends.
+            seed: decides everything random; None: the agent's.
+            progress_bar: show one on the terminal.
+            **settings: of the algorithm, such as ``policy_kwargs`` and ``learning_rate``.
+
+        Returns:
+            The algorithm with the best policy; to train it on, load its saved file with an environment.
+
+        Raises:
+            ValueError, TypeError: the agent has not learned yet, or an argument is none or out of its range.
+            TrainingError: training diverged.
+        """
+        with Bars(progress_bar) as bars:
+            bars.begin(total_timesteps)
+            imagined = imagine(
+                self, algorithm, total_timesteps, num_worlds=num_worlds, episode_steps=episode_steps, starts=starts,
+                trial_every=trial_every, patience=patience, seed=self.seed if seed is None else seed,
+                on_progress=bars.step, **settings,
+            )  # fmt: skip
+        return imagined.model
 
     # -------------------------------------------------------------------------------------------------- predicting
 

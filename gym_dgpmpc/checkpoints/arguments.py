@@ -24,6 +24,7 @@ AGENT_CLASSES = {
     "DGPMPCAgent": "gym_dgpmpc.agents.dgp_mpc",
     "GPMPCAgent": "gym_dgpmpc.agents.gp_mpc",
     "PETSAgent": "gym_dgpmpc.agents.pets",
+    "DynaAgent": "gym_dgpmpc.agents.dyna",
 }
 """The classes that a file may name, and where they are; nothing else is ever imported for a file."""
 

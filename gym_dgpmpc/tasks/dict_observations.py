@@ -91,6 +91,15 @@ def flatten(observation: Any) -> Any:
     return np.concatenate([np.asarray(observation[key]) for key in sorted(observation)], axis=-1)
 
 
+def unflattened(
+    vectors: Float[np.ndarray, "n S"], space: spaces.Space
+) -> Float[np.ndarray, "n S"] | dict[str, np.ndarray]:
+    """n observations as a space has them, the inverse of `flatten`: vectors, or a Dict of parts [n, ...]."""
+    if not isinstance(space, spaces.Dict):
+        return vectors.astype(space.dtype)
+    return {key: vectors[:, part].astype(space[key].dtype) for key, part in layout_of(space).items()}
+
+
 def check_parts(observation: Any, parts: dict[str, slice]) -> None:
     """Refuse a Dict observation, or a batch of them, whose parts are not those of `layout`; empty ``parts`` allow any.
 

@@ -206,7 +206,7 @@ def test_a_task_that_never_ends_is_explored_until_the_first_training_is_due():
 
 
 def test_an_agent_that_waits_for_an_end_says_so(monkeypatch):
-    monkeypatch.setattr("gym_dgpmpc.agents.mpc.ENDLESS", 30)
+    monkeypatch.setattr("gym_dgpmpc.agents.exploration.ENDLESS", 30)
     with pytest.warns(UserWarning, match=r"\b30 random steps.*TimeLimit.*learning_starts"):
         assert agent(Endless()).learn(40).is_exploring
 

@@ -1,0 +1,49 @@
+"""A Dyna of the deep Gaussian process: act by a policy, learn the model, let the policy learn in the model's worlds.
+
+Sutton (1991), "Dyna, an Integrated Architecture for Learning, Planning, and Reacting"; with an ensemble of networks and
+SAC it is MBPO, Janner et al. (2019), "When to Trust Your Model: Model-Based Policy Optimization". The deep Gaussian
+process's worlds are functions, drawn anew for each imagined episode, and last for whole episodes.
+"""
+
+from collections.abc import Mapping
+
+from gym_dgpmpc.agents.dgp_mpc import DGPMPCAgent
+from gym_dgpmpc.checkpoints.interface import StateOf
+from gym_dgpmpc.imagination.controller import PolicyController, improvement_seed
+from gym_dgpmpc.types import StateDict, Stateful
+
+
+class DynaAgent(DGPMPCAgent):
+    """Learns a deep Gaussian process as `DGPMPCAgent` does, and acts by a policy that lives in its worlds.
+
+        agent = DynaAgent("ModCartPole-v0", seed=0, verbose=1)
+        agent.learn(total_timesteps=2_000)
+        agent.imagined_policy.save("policy.zip")  # acts by itself
+
+    After each training of the model the policy goes on learning in new worlds. An action then costs a fraction of a
+    millisecond. With ``acts_by="planner"`` the planner acts, as `DGPMPCAgent` does, and the policy learns beside it.
+
+    Raises:
+        ValueError: an argument is out of its range, or the environment is one that cannot be planned for.
+        TypeError: there is no such setting.
+        AssertionError: the action space is not a Box, as from every SB3 algorithm.
+        UnknownRewardError: of a loaded agent: the reward function that it was given is missing.
+    """
+
+    controller_class = PolicyController
+    controller: PolicyController
+
+    @property
+    def imagined_policy(self):
+        """The policy, a Stable-Baselines3 algorithm; None before the first training."""
+        return self.controller.policy
+
+    def _improve(self) -> Mapping[str, float]:
+        return self.controller.improve(self, improvement_seed(self.seed, len(self.store)))
+
+    def nouns(self) -> dict[str, Stateful]:
+        """What a checkpoint holds, the policy included."""
+        return super().nouns() | {"policy": StateOf(self.controller.state_dict, self._load_policy)}
+
+    def _load_policy(self, state: StateDict) -> None:
+        self.controller.load_policy(self, state)

@@ -1,0 +1,158 @@
+"""A controller that learns a policy in the model's worlds after every training, and acts by it."""
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Literal, get_args
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from gym_dgpmpc.checks import check_counts
+from gym_dgpmpc.errors import PlanningError
+from gym_dgpmpc.imagination.algorithms import AlgorithmName, algorithm_class, suited_settings
+from gym_dgpmpc.imagination.global_randomness import lent_randomness
+from gym_dgpmpc.imagination.policies import imagine, learned_parameters, take_over
+from gym_dgpmpc.imagination.worlds import Imagining
+from gym_dgpmpc.planning.controller import Acted, Controller
+from gym_dgpmpc.planning.plan_state import PlanState
+from gym_dgpmpc.planning.risk import RiskMeasure
+from gym_dgpmpc.planning.rollout import EXPECTED
+from gym_dgpmpc.randomness import derive_seed
+from gym_dgpmpc.tasks.dict_observations import original_space, unflattened
+from gym_dgpmpc.tasks.task import Task
+from gym_dgpmpc.types import DynamicsModel, PlanInfo, Planner, StateDict, TransitionSampler
+
+ActsBy = Literal["policy", "planner"]
+_NOTHING_PLANNED = PlanInfo(float("nan"))
+
+
+class PolicyController(Controller):
+    """Acts by a policy that an algorithm of Stable-Baselines3 learns in the model's worlds.
+
+    Args:
+        dynamics: see `Controller`, as for all that follow up to ``measure``.
+        planner, action_space, num_particles, actions_per_plan, time_budget, measure, device: see `Controller`.
+        algorithm: "SAC", "TD3", "DDPG", "PPO" or "A2C" of Stable-Baselines3; "TQC" or "CrossQ" of sb3-contrib.
+        acts_by: "policy", or "planner": then the policy is learned all the same, for when the run is over.
+        imagined_timesteps: imagined steps from which the policy learns after each training of the model, at most.
+        num_worlds: worlds side by side in which it learns.
+        trial_every: imagined steps between two trials in worlds that it never learns in.
+        trial_patience: trials without a better one after which it stops learning until the next training.
+
+    Raises:
+        TypeError, ValueError: as `Controller`; or a setting is out of its range.
+    """
+
+    largest: ClassVar[Mapping[str, int]] = {"num_worlds": 10**4}
+
+    def __init__(
+        self,
+        dynamics: DynamicsModel,
+        planner: Planner,
+        action_space: spaces.Box,
+        num_particles: int = 5,
+        actions_per_plan: int = 1,
+        time_budget: float | None = None,
+        measure: RiskMeasure = EXPECTED,
+        *,
+        algorithm: AlgorithmName = "SAC",
+        acts_by: ActsBy = "policy",
+        imagined_timesteps: int = 20_000,
+        num_worlds: int = 20,
+        trial_every: int = 2_000,
+        trial_patience: int = 5,
+        device: torch.device | str = "cpu",
+    ):
+        super().__init__(
+            dynamics, planner, action_space, num_particles, actions_per_plan, time_budget, measure, device=device
+        )
+        check_counts(
+            imagined_timesteps=imagined_timesteps,
+            num_worlds=num_worlds,
+            trial_every=trial_every,
+            trial_patience=trial_patience,
+        )
+        if acts_by not in get_args(ActsBy):
+            raise ValueError(f"acts_by must be one of {', '.join(get_args(ActsBy))}, got {acts_by!r}")
+        self._kind = algorithm_class(algorithm)
+        self.acts_by, self.imagined_timesteps, self.num_worlds = acts_by, imagined_timesteps, num_worlds
+        self.trial_every, self.trial_patience = trial_every, trial_patience
+        self.policy: BaseAlgorithm | None = None
+        """What has been learned; None before the first training."""
+
+    def improve(self, agent: Imagining, seed: int) -> dict[str, float]:
+        """Go on learning in the worlds of the agent's model as it is now; metrics to log.
+
+        Raises:
+            TrainingError: learning diverged.
+        """
+        imagined = imagine(
+            agent,
+            self._kind,
+            self.imagined_timesteps,
+            num_worlds=self.num_worlds,
+            trial_every=self.trial_every,
+            patience=self.trial_patience,
+            seed=seed,
+            begin_with=self.policy,
+        )
+        self.policy = imagined.model
+        return {
+            "imagined_steps": imagined.trials[-1].timesteps,
+            "imagined_return": imagined.fresh.mean_return,
+            "imagination_seconds": imagined.seconds,
+        }
+
+    @torch.no_grad()
+    def act(
+        self,
+        task: Task,
+        observation: np.ndarray,
+        carried: PlanState,
+        generator: torch.Generator,
+        worlds: Callable[[], TransitionSampler] | None = None,
+    ) -> Acted:
+        """The policy's action, without noise; or the planner's, see `Controller.act`.
+
+        Raises:
+            PlanningError: the policy returned an action that is not finite; or see `Controller.act`.
+        """
+        if self.policy is None or self.acts_by == "planner":
+            return super().act(task, observation, carried, generator, worlds)
+        started = time.perf_counter()
+        asked = unflattened(observation[None], self.policy.observation_space)
+        action = np.asarray(self.policy.predict(asked, deterministic=True)[0], dtype=np.float32).reshape(-1)
+        if not np.isfinite(action).all():
+            raise PlanningError(f"the policy returned the action {action} at the observation {observation}")
+        action = torch.from_numpy(action).to(self._low).clamp(self._low, self._high).cpu().numpy()
+        return Acted(action, self.cold, _NOTHING_PLANNED, time.perf_counter() - started, False)
+
+    def state_dict(self) -> StateDict:
+        """What the policy has learned; nothing before the first training."""
+        return {} if self.policy is None else dict(learned_parameters(self.policy))
+
+    def load_policy(self, agent: Imagining, state: StateDict) -> None:
+        """Go on from `state_dict`.
+
+        Raises:
+            RuntimeError, KeyError: the state is not that of a policy of this algorithm for these spaces.
+        """
+        self.policy = None
+        if not state:
+            return
+        space = original_space(agent.env, agent.observation_space)
+        settings: dict[str, Any] = suited_settings(self._kind, self.num_worlds, self.imagined_timesteps, space)
+        settings["_init_setup_model"] = False  # for want of an environment it cannot know the spaces yet
+        with lent_randomness():
+            model = self._kind(env=None, device=self.device, **settings)
+            model.observation_space, model.action_space, model.n_envs = space, agent.action_space, 1
+            model._setup_model()
+        take_over(model, state)
+        self.policy = model
+
+
+def improvement_seed(seed: int, num_transitions: int) -> int:
+    """The seed of the imagination that follows a training on so many transitions."""
+    return derive_seed(seed, "imagination", num_transitions)
