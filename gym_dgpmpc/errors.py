@@ -41,5 +41,9 @@ class TrainingError(DGPMPCError, RuntimeError):
     """Training diverged, and going back to the last good state with smaller steps did not help."""
 
 
+class ExportError(DGPMPCError, RuntimeError):
+    """A policy could not be written in the format that was asked for, or the file does not act as the policy does."""
+
+
 class ReliabilityWarning(UserWarning):
     """Something was not as it should be, and was dealt with; the message says how."""

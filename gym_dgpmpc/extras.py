@@ -1,9 +1,10 @@
-"""Python modules that environments need and only an extra of the package brings; how to say that one is missing."""
+"""Python modules that only an extra of the package brings; how to say that one is missing."""
 
 EXTRAS = {
     "gymnasium_robotics": "robotics",
     "minari": "minari",
     "moviepy": "video",
+    "onnx": "onnx",
     "pygame": "classic",
 }
 """Module -> the extra that installs it."""

@@ -119,7 +119,9 @@ class EpisodeRecord:
             return f"{text} | random actions"
         predicted, obtained = self.predicted_and_obtained()
         plan_ms = 1e3 * float(np.mean(self.plan_seconds))
-        text += f" | per step: predicted {predicted:8.3f}, obtained {obtained:8.3f} | {plan_ms:5.0f} ms per plan"
+        if np.isfinite(predicted):
+            text += f" | per step: predicted {predicted:8.3f}, obtained {obtained:8.3f}"
+        text += f" | {plan_ms:5.0f} ms per plan"
         num_nonfinite = sum(info.num_nonfinite for info in self.plans)
         if num_nonfinite:
             text += f" | {num_nonfinite} candidates not finite"
