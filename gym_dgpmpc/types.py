@@ -103,12 +103,13 @@ class TerminatedFn(Protocol):
 class TransitionSampler(Protocol):
     """One draw of the world, valid for the plans of one moment: P particles, each a map (state, action) -> next state.
 
-    ``step`` is the index of the step within the plan, 0 <= step < the horizon the sampler was drawn for; samplers
-    whose functions do not change along a plan ignore it.
+    Actions are [K, A], the same for all particles, as in a plan; or [P, K, A], each particle's own, as a policy decides
+    them by where the particle is. ``step`` is the index of the step within the plan, 0 <= step < the horizon the
+    sampler was drawn for; samplers whose functions do not change along a plan ignore it.
     """
 
     def __call__(
-        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]: ...
 
 

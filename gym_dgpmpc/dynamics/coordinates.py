@@ -59,8 +59,8 @@ class Coordinates:
         seen = seen or SeenTargets.unbounded(encoder.target_size, self.input_mean.device)
         self.lowest, self.highest = (bound.to(dtype) for bound in seen.bounds())
 
-    def encode(self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"]) -> Float[Tensor, "P K D"]:
-        """Standardised model inputs."""
+    def encode(self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"]) -> Float[Tensor, "P K D"]:
+        """Standardised model inputs; the actions are those of all particles, or each one's own."""
         if self._is_finer(observation):
             raw = self.encoder.inputs(observation, action.to(observation).expand(observation.shape[0], -1, -1))
             return self.inputs(raw).to(self.dtype)

@@ -44,7 +44,7 @@ class GaussianSampler:
 
     @torch.no_grad()
     def __call__(
-        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
         mean, variance = self._predict(self._coordinates.encode(observation, action))
         target = mean if variance is None else mean + variance.sqrt() * normals_like(mean, self._generator)

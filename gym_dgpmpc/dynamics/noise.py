@@ -285,7 +285,7 @@ class ObservedSampler:
         self._last: Tensor | None = None
 
     def __call__(
-        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
         if step == 0 or self._last is None or self._last.shape != observation.shape:
             fed = observation - self._errors(observation, self._noise.start_std)

@@ -67,7 +67,7 @@ class SimulatorSampler:
         self._simulator, self._num_particles = simulator, num_particles
 
     def __call__(
-        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
         actions = action.expand(len(observation), -1, -1).flatten(0, 1).unsqueeze(1)
         after = self._simulator.trajectories(observation.flatten(0, 1).cpu().numpy(), actions.cpu().numpy())

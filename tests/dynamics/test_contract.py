@@ -129,6 +129,43 @@ def test_rollouts_have_the_states_shape_and_are_finite(name):
     assert torch.equal(states[..., 2], torch.full_like(states[..., 2], slider.CONSTANT)), "a constant passes through"
 
 
+def moved_by(name, action, seed=5):
+    """One step of a fresh draw from states that differ between the particles."""
+    states = START + 0.3 * torch.randn(PARTICLES, CANDIDATES, 3, generator=seeded(4)) * torch.tensor([1.0, 1.0, 0.0])
+    return fitted(name).draw(PARTICLES, HORIZON, seeded(seed))(states, action, 0)
+
+
+def test_each_particle_may_have_an_action_of_its_own(name):
+    """Alike they are one action of all; otherwise each particle goes by its own, unless the draw mixes particles."""
+    shared, own = actions()[:, 0], torch.rand(PARTICLES, CANDIDATES, 1, generator=seeded(2)) * 2 - 1
+    together = moved_by(name, shared)
+    torch.testing.assert_close(moved_by(name, shared.expand(PARTICLES, -1, -1)), together, rtol=0, atol=1e-6)
+    apart = moved_by(name, own)
+    assert apart.shape == together.shape and not torch.equal(apart, together)
+    if "MM" not in name:
+        for particle in (0, PARTICLES - 1):
+            torch.testing.assert_close(apart[particle], moved_by(name, own[particle])[particle], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.family.startswith(("sparse", "exact"))])
+def test_particles_that_follow_a_linear_policy_move_by_the_closed_loop(name):
+    """Mean and covariance are those of A + B F, of draws that mix particles too. The function's own uncertainty is far
+    less than the noise; `MM` draws its particles anew, with standard errors that five of bound both."""
+    gain, count = torch.tensor([[-1.0, -1.5, 0.0]]), 2000
+    states = 0.3 * torch.randn(count, 1, 3, generator=seeded(4)) * torch.tensor([1.0, 1.0, 0.0]) + START
+    after = fitted(name).draw(count, 1, seeded(5))(states, states @ gain.mT, 0)[:, 0].double()
+    loop = torch.tensor(slider.A + slider.B @ gain.double().numpy())
+    before = states[:, 0].double()
+    known = loop @ before.mT.cov(correction=0) @ loop.mT
+    variance = known.diagonal()
+    if CASES[name].make().draw_kind == "MM":
+        known = torch.diag(variance)
+    error = (after.mean(0) - loop @ before.mean(0)).abs()
+    assert (error <= 5 * (variance / count).sqrt() + NOISE).all()
+    error = (after.mT.cov(correction=0) - known).abs()
+    assert (error <= 5 * (2 / count) ** 0.5 * (variance.unsqueeze(0) * variance.unsqueeze(1)).sqrt() + NOISE**2).all()
+
+
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.family != "truth"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_double_precision_draw_follows_states_of_either_precision(name, dtype):

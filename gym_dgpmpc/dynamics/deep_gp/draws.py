@@ -63,7 +63,7 @@ class ConditionalSampler:
         self._noise_std = noise_std
 
     def __call__(
-        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
         (model, factors), whitened = self._posterior
         x = self._coordinates.encode(observation, action).to(factors[0].dtype)
@@ -195,7 +195,7 @@ class PathwiseSampler:
         self._buffers: _Buffers | None = None
 
     def __call__(
-        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
         if self.noise is not None:
             observation = self.noise.fed(observation, step)

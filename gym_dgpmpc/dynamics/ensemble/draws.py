@@ -44,7 +44,7 @@ class EnsembleSampler:
 
     @torch.no_grad()
     def __call__(
-        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
         x = self._coordinates.encode(observation, action)
         if self._shuffle:

@@ -20,22 +20,22 @@ from gym_dgpmpc.gp.moments import Predictor, predicted_moments
 
 
 class Encoded(NamedTuple):
-    """Moments of the encoded inputs x of a Gaussian state s under a known action."""
+    """Moments of the encoded inputs x of a Gaussian state s and action a."""
 
     mean: Float[Tensor, "K D"]
     covariance: Float[Tensor, "K D D"]
     cross: Float[Tensor, "K S D"]  # Cov[s, x]
 
 
-def encoded_moments(
-    encoder: Encoder, mean: Float[Tensor, "K S"], covariance: Float[Tensor, "K S S"], action: Float[Tensor, "K A"]
-) -> Encoded:
+def encoded_moments(encoder: Encoder, mean: Float[Tensor, "K n"], covariance: Float[Tensor, "K n n"]) -> Encoded:
     """Exact moments of the plain dimensions, the sines and cosines of angles, and the action, in the encoder's order.
+
+    Mean and covariance are those of (s, a) together, n = S + A; an action that is known does not vary.
 
     For theta ~ N(m, v): E[sin theta] = exp(-v/2) sin m, E[cos theta] = exp(-v/2) cos m, products by the addition
     theorems, and by Stein's lemma Cov[s, sin theta] = Cov[s, theta] E[cos theta] (for the cosine: -E[sin theta]).
     """
-    plain, angles = encoder.plain, encoder.angles
+    plain, angles, num_states = encoder.plain, encoder.angles, encoder.observation_size
     centre, own = mean[:, angles], covariance[:, angles][:, :, angles]
     spread = own.diagonal(dim1=-2, dim2=-1)
     damping = torch.exp(-0.5 * spread)
@@ -59,19 +59,20 @@ def encoded_moments(
     to_angles = covariance[:, :, angles]
     cross_waves = torch.cat([to_angles * cosine.unsqueeze(1), -to_angles * sine.unsqueeze(1)], -1)
 
-    known = mean.new_zeros(len(mean), mean.shape[1], action.shape[1])
-    cross = torch.cat([covariance[:, :, plain], cross_waves, known], -1)
+    cross = torch.cat([covariance[:, :, plain], cross_waves, covariance[:, :, num_states:]], -1)
     size, first, last = encoder.input_size, len(plain), len(plain) + waves.shape[1]
     joint = mean.new_zeros(len(mean), size, size)
-    joint[:, :first] = cross[:, plain]
-    joint[:, :, :first] = cross[:, plain].mT
+    for place, of in ((slice(first), plain), (slice(last, size), slice(num_states, None))):
+        joint[:, place] = cross[:, of]
+        joint[:, :, place] = cross[:, of].mT
     joint[:, first:last, first:last] = second - waves.unsqueeze(-1) * waves.unsqueeze(-2)
-    return Encoded(torch.cat([mean[:, plain], waves, action], -1), joint, cross)
+    return Encoded(torch.cat([mean[:, plain], waves, mean[:, num_states:]], -1), joint, cross[:, :num_states])
 
 
 class MomentMatchingSampler:
     """Moves each candidate's Gaussian one step, and spreads the particles by it.
 
+    Actions that differ between the particles are Gaussian together with the state, as the particles say.
     A candidate with a particle or an action that is not finite is NaN after the step, and affects no other.
 
     Args:
@@ -114,22 +115,19 @@ class MomentMatchingSampler:
 
     @torch.no_grad()
     def __call__(
-        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "K A"], step: int
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
         # Factorisations are batched over the candidates, and fail for all if one of them is not finite.
-        lost = ~(observation.isfinite().all(-1).all(0) & action.isfinite().all(-1)).unsqueeze(-1)
-        states = observation.to(self._frame.dtype).masked_fill(lost, 0.0)
-        mean = states.mean(0)
-        deviation = (states - mean).transpose(0, 1)
-        actions = action.to(states).masked_fill(lost, 0.0)
-        covariance = deviation.mT @ deviation / len(states)
-        if self._blur is not None and step == 0:
-            covariance = covariance + torch.diag(self._blur.start_std.square())
-        elif self._blur is not None:
-            stretch = 1.0 + self._blur.stretch
-            covariance = _without(covariance, torch.diag(self._blur.std.square())) * stretch.unsqueeze(-1) * stretch
-            mean = self._blur.fed(mean)
-        mean, covariance = self.propagate(mean, covariance, actions)
+        actions = action.expand(len(observation), -1, -1)
+        points = torch.cat([part.to(self._frame.dtype) for part in (observation, actions)], -1)
+        lost = ~points.isfinite().all(-1).all(0).unsqueeze(-1)
+        points = points.masked_fill(lost, 0.0)
+        mean = points.mean(0)
+        deviation = (points - mean).transpose(0, 1)
+        covariance = deviation.mT @ deviation / len(points)
+        if self._blur is not None:
+            mean, covariance = self._fed(self._blur, mean, covariance, is_start=step == 0)
+        mean, covariance = self.propagate(mean, covariance)
         if self._blur is not None:
             covariance = covariance + torch.diag(self._blur.std.square())
         values, vectors = torch.linalg.eigh(covariance)
@@ -137,11 +135,35 @@ class MomentMatchingSampler:
         spread = torch.einsum("ps,kts->pkt", self._frame, root)
         return (mean + spread).masked_fill(lost, math.nan).to(observation.dtype)
 
+    def _fed(
+        self, blur: ObservationNoise, mean: Float[Tensor, "K n"], covariance: Float[Tensor, "K n n"], *, is_start: bool
+    ) -> tuple[Float[Tensor, "K n"], Float[Tensor, "K n n"]]:
+        """Moments of what the model is fed, and of the action, from those of what is observed, and of the action.
+
+        An action that was decided by what is observed, o = x + e, depends on x by Cov[x, o] Cov[o, o]^-1 Cov[o, a].
+        """
+        size, mean, covariance = self._encoder.observation_size, mean.clone(), covariance.clone()
+        own, across = covariance[:, :size, :size], covariance[:, :size, size:]
+        if is_start:
+            covariance[:, :size, :size] += torch.diag(blur.start_std.square())
+            return mean, covariance
+        stretch, state = 1.0 + blur.stretch, _without(own, torch.diag(blur.std.square()))
+        across = stretch.unsqueeze(-1) * (state @ torch.linalg.pinv(own, hermitian=True) @ across)
+        mean[:, :size] = blur.fed(mean[:, :size])
+        covariance[:, :size, :size] = state * stretch.unsqueeze(-1) * stretch
+        covariance[:, :size, size:], covariance[:, size:, :size] = across, across.mT
+        return mean, covariance
+
     def propagate(
-        self, mean: Float[Tensor, "K S"], covariance: Float[Tensor, "K S S"], action: Float[Tensor, "K A"]
+        self, mean: Float[Tensor, "K n"], covariance: Float[Tensor, "K n n"]
     ) -> tuple[Float[Tensor, "K S"], Float[Tensor, "K S S"]]:
-        """Mean and covariance of the next state: of c s + E f, with c the dimensions that f only changes."""
-        encoded = encoded_moments(self._encoder, mean, covariance, action)
+        """Mean and covariance of the next state: of c s + E f, with c the dimensions that f only changes.
+
+        Given are those of (s, a) together, n = S + A.
+        """
+        encoded = encoded_moments(self._encoder, mean, covariance)
+        size = self._encoder.observation_size
+        mean, covariance = mean[:, :size], covariance[:, :size, :size]
         scale, predicted = self._inputs.std, self._encoder.predicted
         output = predicted_moments(
             self._predictor, self._inputs(encoded.mean), encoded.covariance / (scale.unsqueeze(-1) * scale)

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from gym_dgpmpc.data.encoding import Encoder
+from gym_dgpmpc.dynamics.noise import ObservationNoise
 from gym_dgpmpc.dynamics.sparse_gp.model import SparseGPDynamics
 from gym_dgpmpc.dynamics.sparse_gp.moment_matching import encoded_moments, orthonormal_frame
 from gym_dgpmpc.types import ObservationSpec, Transitions
@@ -17,6 +18,16 @@ def gaussian(size, count=3, seed=1, scale=0.5):
     return normal(generator, count, size), root @ root.mT
 
 
+def with_action(mean, covariance, action):
+    """Moments of the state and a known action."""
+    return torch.cat([mean, action], -1), torch.nn.functional.pad(covariance, (0, action.shape[-1]) * 2)
+
+
+def follow(gain):
+    """The matrix from a state to it and the action of a linear policy."""
+    return torch.cat([torch.eye(gain.shape[1], dtype=gain.dtype), gain])
+
+
 def weighted_nodes(mean, covariance, order=24):
     """Gauss and Hermite's nodes [n, S] and weights [n] of a Gaussian."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(order)
@@ -27,14 +38,14 @@ def weighted_nodes(mean, covariance, order=24):
 
 
 def test_the_encodings_moments_are_exact():
-    """Two angles, one plain number and one that is not fed, against quadrature."""
+    """Two angles, one plain number, one that is not fed, and an action that goes by all of them, against quadrature."""
     encoder = Encoder(4, 1, ObservationSpec(angles=(2, 0), not_inputs=(3,)))
     mean, covariance = gaussian(4)
-    action = normal(seeded(2), 3, 1)
-    found = encoded_moments(encoder, mean, covariance, action)
+    gain = normal(seeded(2), 1, 4)
+    found = encoded_moments(encoder, mean @ follow(gain).mT, follow(gain) @ covariance @ follow(gain).mT)
     for k in range(3):
         states, weight = weighted_nodes(mean[k], covariance[k])
-        x = encoder.inputs(states, action[k].expand(len(states), -1))
+        x = encoder.inputs(states, states @ gain.mT)
         expected = weight @ x
         torch.testing.assert_close(found.mean[k], expected, rtol=0, atol=1e-9)
         centred = weight.unsqueeze(-1) * (x - expected)
@@ -45,7 +56,7 @@ def test_the_encodings_moments_are_exact():
 def test_without_angles_the_encoding_is_a_choice_of_rows():
     encoder = Encoder(3, 1, ObservationSpec(not_inputs=(1,)))
     mean, covariance = gaussian(3)
-    found = encoded_moments(encoder, mean, covariance, torch.zeros(3, 1, dtype=torch.float64))
+    found = encoded_moments(encoder, *with_action(mean, covariance, torch.zeros(3, 1, dtype=torch.float64)))
     assert torch.equal(found.mean[:, :2], mean[:, [0, 2]])
     assert torch.equal(found.covariance[:, :2, :2], covariance[:, [0, 2]][:, :, [0, 2]])
     assert float(found.covariance[:, 2].abs().max()) == 0.0
@@ -80,7 +91,7 @@ def test_a_step_has_the_moments_of_many_draws(add_noise):
     covariance[:, 3], covariance[:, :, 3] = 0.0, 0.0
     mean[:, 3] = 0.3
     action = normal(seeded(2), 3, 1)
-    found_mean, found_covariance = sampler.propagate(mean, covariance, action)
+    found_mean, found_covariance = sampler.propagate(*with_action(mean, covariance, action))
     count = 100_000
     one_by_one = trained(draw="DS", add_noise=add_noise, dtype=torch.float64).draw(1, 1, seeded(8))
     for k in range(3):
@@ -108,7 +119,7 @@ def test_the_particles_carry_the_gaussian_from_step_to_step():
     mean, covariance = start.double().expand(2, -1), torch.zeros(2, 4, 4, dtype=torch.float64)
     states = start.double().expand(7, 2, -1)
     for step, action in enumerate(actions):
-        mean, covariance = sampler.propagate(mean, covariance, action)
+        mean, covariance = sampler.propagate(*with_action(mean, covariance, action))
         states = sampler(states, action, step)
     sums = sampler._predictor.weights.abs().sum(0) * sampler._targets.std
     rounding = 3 * torch.finfo(torch.float64).eps * float(sums.max()) ** 2
@@ -116,6 +127,19 @@ def test_the_particles_carry_the_gaussian_from_step_to_step():
     torch.testing.assert_close(states.mean(0), mean, rtol=0, atol=rounding)
     deviation = (states - states.mean(0)).transpose(0, 1)
     torch.testing.assert_close(deviation.mT @ deviation / 7, covariance, rtol=0, atol=rounding)
+
+
+def test_an_action_that_goes_by_what_is_observed_varies_with_the_state_only():
+    """With a = F o and o = x + e, Cov[x, a] = Cov[x] F^T, since e is independent of x."""
+    gain, blur = normal(seeded(2), 1, 4), ObservationNoise(*(torch.full((4,), x).double() for x in (0.2, 0.1, 0.4)))
+    mean, state = gaussian(4)
+    observed = follow(gain) @ (state + 0.2**2 * torch.eye(4)) @ follow(gain).mT
+    sampler = trained().draw(5, 1, seeded())
+    fed_mean, fed = sampler._fed(blur, mean @ follow(gain).mT, observed, is_start=False)
+    torch.testing.assert_close(fed_mean, torch.cat([blur.fed(mean), mean @ gain.mT], -1))
+    torch.testing.assert_close(fed[:, :4, :4], 1.1**2 * state)
+    torch.testing.assert_close(fed[:, :4, 4:], 1.1 * state @ gain.mT)
+    torch.testing.assert_close(fed[:, 4:], torch.cat([fed[:, :4, 4:].mT, observed[:, 4:, 4:]], -1))
 
 
 @pytest.mark.parametrize(("num_particles", "size"), [(5, 4), (19, 18), (20, 3)])
