@@ -43,7 +43,7 @@ def algorithm_class(algorithm: AlgorithmName | str | type[BaseAlgorithm]) -> typ
 def suited_settings(
     algorithm: type[BaseAlgorithm], num_worlds: int, total_timesteps: int, space: spaces.Space
 ) -> dict[str, Any]:
-    """An algorithm's arguments for so many worlds: off the policy, a gradient step for every second imagined step.
+    """An algorithm's arguments for so many worlds: off the policy, a gradient step for every imagined step.
 
     On the policy, and where the algorithm has other arguments, its own defaults.
     """
@@ -52,7 +52,9 @@ def suited_settings(
     if "gradient_steps" in inspect.signature(algorithm).parameters:
         settings |= {
             "train_freq": 1,
-            "gradient_steps": max(num_worlds // 2, 1),
+            "gradient_steps": num_worlds,
+            "batch_size": 128,
+            "learning_rate": 1e-3,
             "buffer_size": max(total_timesteps, num_worlds),
             "learning_starts": min(1_000, total_timesteps // 10),
         }

@@ -14,7 +14,7 @@ from gym_dgpmpc.errors import PlanningError
 from gym_dgpmpc.imagination.algorithms import AlgorithmName, algorithm_class, suited_settings
 from gym_dgpmpc.imagination.global_randomness import lent_randomness
 from gym_dgpmpc.imagination.policies import imagine, learned_parameters, take_over
-from gym_dgpmpc.imagination.worlds import Imagining
+from gym_dgpmpc.imagination.worlds import ImaginedVecEnv, Imagining
 from gym_dgpmpc.planning.controller import Acted, Controller
 from gym_dgpmpc.planning.plan_state import PlanState
 from gym_dgpmpc.planning.risk import RiskMeasure
@@ -143,14 +143,22 @@ class PolicyController(Controller):
         if not state:
             return
         space = original_space(agent.env, agent.observation_space)
-        settings: dict[str, Any] = suited_settings(self._kind, self.num_worlds, self.imagined_timesteps, space)
-        settings["_init_setup_model"] = False  # for want of an environment it cannot know the spaces yet
+        settings = suited_settings(self._kind, self.num_worlds, self.imagined_timesteps, space)
+        # The algorithm reads the spaces off its environment; this one is never stepped.
+        never = ImaginedVecEnv(self.dynamics, _unasked, _unasked, space, agent.action_space, num_worlds=1)
         with lent_randomness():
-            model = self._kind(env=None, device=self.device, **settings)
-            model.observation_space, model.action_space, model.n_envs = space, agent.action_space, 1
-            model._setup_model()
+            model = self._kind(env=never, device=self.device, **settings)
+        model.env = None
         take_over(model, state)
         self.policy = model
+
+
+def _not_asked(*_: Any) -> Any:
+    raise NotImplementedError("these worlds are there for their spaces alone")
+
+
+_unasked: Any = _not_asked
+"""In place of the functions of worlds in which nobody lives."""
 
 
 def improvement_seed(seed: int, num_transitions: int) -> int:
