@@ -5,6 +5,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import gymnasium
 import typer
@@ -47,6 +48,36 @@ def prepare_video(env_id: str) -> str:
     if rendering.mujoco_gl:
         os.environ["MUJOCO_GL"] = rendering.mujoco_gl
     return rendering.why_not
+
+
+def agent_file(path: Path) -> Path:
+    """The agent's file of a folder that `dgpmpc train` wrote, or the file itself.
+
+    Raises:
+        ValueError: there is none.
+    """
+    from gym_dgpmpc.checkpoints.folder import NEWEST
+
+    file = path / NEWEST if path.is_dir() else path
+    if not file.is_file():
+        raise ValueError(f"expected a folder of `dgpmpc train` or an agent's file, but there is no file {file}")
+    return file
+
+
+def environment_of(file: Path, env_id: str | None) -> str:
+    """The id that was asked for, or else that of the environment in which the file's agent was trained.
+
+    Raises:
+        ValueError: the file does not say it.
+        CheckpointError: it cannot be read.
+    """
+    from gym_dgpmpc.checkpoints.format import read_checkpoint
+    from gym_dgpmpc.checkpoints.restore import about_environment
+
+    env_id = env_id or about_environment(read_checkpoint(file)).get("environment")
+    if env_id is None:
+        raise ValueError(f"{file} does not say which environment it was trained in: give --env ENV_ID")
+    return env_id
 
 
 def make(env_id: str, *, render: bool) -> gymnasium.Env:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from gym_dgpmpc.cli.common import make, one_line_errors, prepare_video, use_threads
+from gym_dgpmpc.cli.common import agent_file, environment_of, make, one_line_errors, prepare_video, use_threads
 
 
 def evaluate(
@@ -30,9 +30,6 @@ def evaluate(
     from stable_baselines3.common.evaluation import evaluate_policy
 
     from gym_dgpmpc.agents import MPCAgent
-    from gym_dgpmpc.checkpoints.folder import NEWEST
-    from gym_dgpmpc.checkpoints.format import read_checkpoint
-    from gym_dgpmpc.checkpoints.restore import about_environment
     from gym_dgpmpc.runs.recording import Episode, EpisodeRecorder
     from gym_dgpmpc.runs.rendering import write_gif
 
@@ -44,12 +41,8 @@ def evaluate(
 
     with one_line_errors(ValueError, AssertionError, OSError):
         use_threads(threads)
-        file = path / NEWEST if path.is_dir() else path
-        if not file.is_file():
-            raise ValueError(f"expected a folder of `dgpmpc train` or an agent's file, but there is no file {file}")
-        env_id = env_id or about_environment(read_checkpoint(file)).get("environment")
-        if env_id is None:
-            raise ValueError(f"{file} does not say which environment it was trained in: give --env ENV_ID")
+        file = agent_file(path)
+        env_id = environment_of(file, env_id)
         no_video = prepare_video(env_id) if video else "not asked for"
         recorder = EpisodeRecorder(make(env_id, render=not no_video), show)
         agent = MPCAgent.load(file, env=recorder)

@@ -67,8 +67,7 @@ def export_policy(model: BaseAlgorithm, path: str | os.PathLike[str]) -> Path:
         ExportError: ONNX is not installed, or the file does not act as the policy does.
     """
     path, space = Path(path), model.observation_space
-    if path.suffix not in (".pt", ".onnx"):
-        raise ValueError(f"a policy is exported to a file with the suffix .pt or .onnx, got {path.name!r}")
+    check_suffix(path)
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise ValueError(
             f"only policies of observations that are vectors can be exported, got {space}: for Dict observations put "
@@ -88,6 +87,12 @@ def export_policy(model: BaseAlgorithm, path: str | os.PathLike[str]) -> Path:
         model.policy.set_training_mode(was_training)
     _check_alike(model, path, observations)
     return path
+
+
+def check_suffix(path: Path) -> None:
+    """Raise a ValueError unless a policy can be exported to a file of that name."""
+    if path.suffix not in (".pt", ".onnx"):
+        raise ValueError(f"a policy is exported to a file with the suffix .pt or .onnx, got {path.name!r}")
 
 
 def run_exported(
