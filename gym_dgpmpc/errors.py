@@ -9,6 +9,10 @@ class PlanningError(DGPMPCError, RuntimeError):
     """No candidate action sequence had a finite score, or a planner returned something else than a plan of its own."""
 
 
+class NotDifferentiableError(DGPMPCError, TypeError):
+    """A gradient was asked for of something that has none: draws of a model, or a planner's objective."""
+
+
 class EnvironmentDataError(DGPMPCError, ValueError):
     """The environment returned something that cannot be learned from (for example a NaN observation)."""
 

@@ -106,6 +106,9 @@ class TransitionSampler(Protocol):
     Actions are [K, A], the same for all particles, as in a plan; or [P, K, A], each particle's own, as a policy decides
     them by where the particle is. ``step`` is the index of the step within the plan, 0 <= step < the horizon the
     sampler was drawn for; samplers whose functions do not change along a plan ignore it.
+
+    Next states are differentiable by states and actions where these require gradients, with the values that they have
+    otherwise, up to rounding; a sampler that has no gradients raises `NotDifferentiableError` then, or records none.
     """
 
     def __call__(
@@ -120,7 +123,10 @@ class TrajectorySampler(TransitionSampler, Protocol):
     def trajectories(
         self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]
     ) -> Float[Tensor, "H_plus_1 P K S"]:
-        """What repeated calls from ``observation`` give; ``states[0]`` is the observation itself."""
+        """What repeated calls from ``observation`` give; ``states[0]`` is the observation itself.
+
+        Differentiable where a step is.
+        """
         ...
 
 

@@ -14,9 +14,10 @@ import torch
 
 from gym_dgpmpc import compiler
 from gym_dgpmpc.dynamics.deep_gp import compiled_rollout
+from gym_dgpmpc.dynamics.deep_gp.draws import CompiledPathwiseSampler
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.inference import compiled_layers
-from gym_dgpmpc.types import TrajectorySampler, Transitions
+from gym_dgpmpc.types import Transitions
 from tests.oracles.models import normal, seeded
 
 needs_compiler = pytest.mark.skipif(not compiled_rollout.is_available(), reason="no C++ compiler works here")
@@ -62,7 +63,7 @@ def test_without_a_compiler_one_warning_and_the_same_worlds(monkeypatch, command
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         world = model.draw(2, 3, seeded())
-    assert not isinstance(world, TrajectorySampler)
+    assert not isinstance(world, CompiledPathwiseSampler)
     assert world(observation.expand(2, -1, -1).clone(), observation[:, :2], 0).isfinite().all()
 
 

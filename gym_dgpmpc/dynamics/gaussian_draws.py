@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gym_dgpmpc.autograd import grad_if_asked
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 
 
@@ -42,12 +43,12 @@ class GaussianSampler:
         self._predict, self._coordinates, self._generator = predict, coordinates, generator
         self._match_moments = match_moments
 
-    @torch.no_grad()
+    @grad_if_asked
     def __call__(
         self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
         mean, variance = self._predict(self._coordinates.encode(observation, action))
-        target = mean if variance is None else mean + variance.sqrt() * normals_like(mean, self._generator)
+        target = mean if variance is None else mean + root(variance) * normals_like(mean, self._generator)
         states = self._coordinates.decode(observation, target)
         return match_moments(states, self._generator) if self._match_moments else states
 
@@ -59,7 +60,13 @@ def match_moments(states: Float[Tensor, "P K S"], generator: torch.Generator) ->
     step, as in the published code of PETS. The moments are those of the next state, where that code takes the change's.
     """
     variance, mean = torch.var_mean(states, dim=0, correction=0, keepdim=True)
-    return mean + variance.sqrt() * normals_like(states, generator)
+    return mean + root(variance) * normals_like(states, generator)
+
+
+def root(variance: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """The standard deviation, whose gradient is taken as zero where nothing varies: there it has none."""
+    constant = variance == 0
+    return variance.masked_fill(constant, 1.0).sqrt().masked_fill(constant, 0.0)
 
 
 def normals_like(like: Float[Tensor, "*b"], generator: torch.Generator) -> Float[Tensor, "*b"]:

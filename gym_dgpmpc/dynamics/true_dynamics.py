@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gym_dgpmpc.autograd import refuse_if_asked
 from gym_dgpmpc.envs.simulator import Simulator
 from gym_dgpmpc.types import StateDict, Transitions, TransitionSampler
 
@@ -61,7 +62,10 @@ class TrueDynamics:
 
 
 class SimulatorSampler:
-    """Moves every particle by the simulator, one step or a whole plan at a time."""
+    """Moves every particle by the simulator, one step or a whole plan at a time.
+
+    It has no gradients, and refuses where one is asked for (`NotDifferentiableError`).
+    """
 
     def __init__(self, simulator: Simulator, num_particles: int):
         self._simulator, self._num_particles = simulator, num_particles
@@ -69,6 +73,7 @@ class SimulatorSampler:
     def __call__(
         self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
+        refuse_if_asked(self, observation, action)
         actions = action.expand(len(observation), -1, -1).flatten(0, 1).unsqueeze(1)
         after = self._simulator.trajectories(observation.flatten(0, 1).cpu().numpy(), actions.cpu().numpy())
         return torch.from_numpy(after[:, 0]).to(observation).view_as(observation)
@@ -77,6 +82,7 @@ class SimulatorSampler:
         self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]
     ) -> Float[Tensor, "H_plus_1 P K S"]:
         """What repeated calls from ``observation`` give, without rounding the states in between."""
+        refuse_if_asked(self, observation, actions)
         start = observation.expand(len(actions), -1)
         after = self._simulator.trajectories(start.cpu().numpy(), actions.cpu().numpy())
         states = torch.cat([start.unsqueeze(1), torch.from_numpy(after).to(observation)], 1)  # "K H+1 S"

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gym_dgpmpc.autograd import grad_if_asked
 from gym_dgpmpc.checks import check_reals
 
 RiskName = Literal["mean", "mean-std", "cvar", "worst", "best"]
@@ -57,9 +58,9 @@ class RiskMeasure:
         check_reals("(-inf, inf)", risk_aversion=self.risk_aversion)
         check_reals("(0, 1]", cvar_share=self.cvar_share)
 
-    @torch.no_grad()
+    @grad_if_asked
     def __call__(self, returns: Float[Tensor, "P K"]) -> Float[Tensor, " K"]:
-        """The scores of K candidates."""
+        """The scores of K candidates, differentiable where the returns require gradients."""
         measures: Mapping[str, Callable[[], Tensor]] = {
             "mean": lambda: returns.mean(dim=0),
             "mean-std": lambda: mean_minus_std(returns, self.risk_aversion),

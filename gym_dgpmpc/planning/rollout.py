@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gym_dgpmpc.autograd import grad_if_asked, not_differentiable
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.planning.risk import RiskMeasure
 from gym_dgpmpc.types import Objective, RewardFn, TerminatedFn, TrajectorySampler, TransitionSampler
@@ -21,7 +22,7 @@ from gym_dgpmpc.types import Objective, RewardFn, TerminatedFn, TrajectorySample
 EXPECTED = RiskMeasure()
 
 
-@torch.no_grad()
+@grad_if_asked
 def rollout(
     sampler: TransitionSampler,
     observation: Float[Tensor, " S"],
@@ -30,37 +31,38 @@ def rollout(
 ) -> Float[Tensor, "H_plus_1 P K S"]:
     """The states that K action sequences lead to from one observation, for each of P particles.
 
+    Differentiable where the observation or the actions require gradients.
+
     Returns:
         ``states``, of the observation's dtype and device: ``states[0]`` is the observation, ``states[t + 1]`` the
         state after action t. With the axes in this order every step writes one contiguous block.
 
     Raises:
         ValueError: the sampler's result has the wrong shape (it would be broadcast silently).
+        NotDifferentiableError: a gradient is required, and the sampler has none.
     """
     num_candidates, horizon, _ = actions.shape
     expected = (horizon + 1, num_particles, num_candidates, *observation.shape)
     if isinstance(sampler, TrajectorySampler):
-        states = sampler.trajectories(observation, actions)
-        if states.shape != expected:
+        trajectories = _recorded(sampler, sampler.trajectories(observation, actions))
+        if trajectories.shape != expected:
             raise ValueError(
                 f"the sampler's trajectories must have the shape [H + 1, P, K, S] = {expected}, "
-                f"got {tuple(states.shape)}"
+                f"got {tuple(trajectories.shape)}"
             )
-        return states.to(observation)
-    states = observation.new_empty(expected)
-    states[0] = observation
-    for step, action in enumerate(actions.to(states).transpose(0, 1).contiguous()):
-        next_state = sampler(states[step], action, step)
-        if next_state.shape != states[step].shape:
+        return trajectories.to(observation)
+    states = [observation.expand(expected[1:]).contiguous()]
+    for step, action in enumerate(actions.to(observation).transpose(0, 1).contiguous()):
+        next_state = _recorded(sampler, sampler(states[step], action, step))
+        if next_state.shape != expected[1:]:
             raise ValueError(
-                f"the transition sampler must return [P, K, S] = {tuple(states[step].shape)}, "
-                f"got {tuple(next_state.shape)}"
+                f"the transition sampler must return [P, K, S] = {expected[1:]}, got {tuple(next_state.shape)}"
             )
-        states[step + 1] = next_state
-    return states
+        states.append(next_state.to(observation).contiguous())
+    return torch.stack(states)
 
 
-@torch.no_grad()
+@grad_if_asked
 def particle_returns(
     states: Float[Tensor, "H_plus_1 P K S"],
     actions: Float[Tensor, "K H A"],
@@ -72,6 +74,9 @@ def particle_returns(
     The step that terminates earns its reward; whatever the model predicts after it counts for nothing. A particle
     whose state is not finite while it is alive has the return NaN, even where the reward function would hide that
     (a comparison with NaN is simply false), so that a diverged particle cannot pass for a good one.
+
+    Differentiable where the states require gradients; that the reward is, is up to its function. When a particle
+    terminates has no gradient.
 
     Raises:
         ValueError: the reward or the termination has the wrong shape or dtype.
@@ -104,6 +109,9 @@ def rollout_objective(
 ) -> Objective:
     """The planner's objective: what ``measure`` makes of the particles' returns from ``observation``.
 
+    It is differentiable exactly where the actions that it is given, or the observation, require gradients, and then
+    has the same value as otherwise; see `rollout`.
+
     One particle that is not finite makes its candidate's score not finite; no measure leaves such a one out.
 
     Raises:
@@ -120,6 +128,13 @@ def rollout_objective(
         return measure(particle_returns(states, actions, reward_fn, terminated_fn))
 
     return score
+
+
+def _recorded(sampler: TransitionSampler, states: Tensor) -> Tensor:
+    """The states, if their gradient was recorded where it is required."""
+    if torch.is_grad_enabled() and not states.requires_grad:
+        raise not_differentiable(sampler)
+    return states
 
 
 def _alive(terminated: Bool[Tensor, "H *b"]) -> Bool[Tensor, "H *b"]:

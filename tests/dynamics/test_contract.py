@@ -16,6 +16,7 @@ from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
 from gym_dgpmpc.dynamics.noise import NoiseSplit
 from gym_dgpmpc.dynamics.sparse_gp.model import GP_DRAWS, SparseGPDynamics
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
+from gym_dgpmpc.errors import NotDifferentiableError
 from gym_dgpmpc.planning.rollout import rollout
 from gym_dgpmpc.types import DynamicsModel, Transitions, TransitionSampler
 from tests.oracles import linear_gaussian, slider
@@ -176,6 +177,67 @@ def test_a_double_precision_draw_follows_states_of_either_precision(name, dtype)
     assert after.dtype == dtype and after.isfinite().all()
     states = rollout(model.draw(PARTICLES, HORIZON, seeded(5)), START.to(dtype), actions(), PARTICLES)
     assert torch.equal(states[1], after) and states.isfinite().all()
+
+
+WITHOUT_GRADIENTS = ["truth", "sparse-AMM"]
+
+
+def weighted(states):
+    """A number that every state has its part in."""
+    return (states * torch.randn(states.shape, generator=seeded(8), dtype=states.dtype)).sum()
+
+
+def along_actions(sampler, start, plans):
+    return weighted(rollout(sampler, start, plans, PARTICLES))
+
+
+def by_a_policy(sampler, start, gain):
+    """Closed loop: each particle's action is decided by its state."""
+    states = [start.expand(PARTICLES, CANDIDATES, 3)]
+    for step in range(HORIZON):
+        states.append(sampler(states[-1], states[-1] @ gain.mT, step))
+    return weighted(torch.stack(states))
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name not in WITHOUT_GRADIENTS])
+@pytest.mark.parametrize("value_of", [along_actions, by_a_policy])
+def test_gradients_are_those_of_the_values(name, value_of):
+    """By the start, the actions and a policy's parameters, against differences over draws of the same random numbers.
+
+    Networks compute in single precision, whose rounding a wider difference has to stay above. Its own error falls as
+    the fourth power of the width.
+    """
+    model = CASES[name].make(dtype=torch.float64)
+    model.load_state_dict(trained_state(CASES[name].family))
+    chosen = actions() if value_of is along_actions else torch.tensor([[-0.4, -0.6, 0.1]])
+    places = [START.double(), chosen.double()]
+    directions = [torch.randn(place.shape, generator=seeded(9), dtype=torch.float64) for place in places]
+
+    def value(shift):
+        moved = [place + shift * direction for place, direction in zip(places, directions, strict=True)]
+        return value_of(model.draw(PARTICLES, HORIZON, seeded(5)), *moved)
+
+    variables = [place.clone().requires_grad_() for place in places]
+    recorded = value_of(model.draw(PARTICLES, HORIZON, seeded(5)), *variables)
+    found = sum(
+        (gradient * direction).sum()
+        for gradient, direction in zip(torch.autograd.grad(recorded, variables), directions, strict=True)
+    )
+    assert recorded.item() == pytest.approx(value(0.0).item(), rel=1e-12), "a recorded gradient changes no value"
+    width, rounding = (2e-2, 1e-3) if CASES[name].family == "ensemble" else (3e-4, 1e-6)
+    near, far = ((value(shift) - value(-shift)) / (2 * shift) for shift in (width, 2 * width))
+    known = (4 * near - far) / 3
+    assert abs(found - known) <= rounding * (1 + abs(known)), (found, known, near, far)
+
+
+@pytest.mark.parametrize("name", WITHOUT_GRADIENTS)
+def test_what_has_no_gradients_says_so(name):
+    sampler, plans = fitted(name).draw(PARTICLES, HORIZON, seeded(5)), actions().requires_grad_()
+    for take in (lambda: rollout(sampler, START, plans, PARTICLES), lambda: moved_by(name, plans[:, 0])):
+        with pytest.raises(NotDifferentiableError, match=rf"^{type(sampler).__name__} has no gradients.*cem"):
+            take()
+    with torch.no_grad():
+        rollout(sampler, START, plans, PARTICLES)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from gym_dgpmpc.errors import NotDifferentiableError
 from gym_dgpmpc.planning import particle_returns, rollout, rollout_objective
+from gym_dgpmpc.planning.risk import RiskMeasure
 from tests.oracles import linear_gaussian
 
 A = np.array([[1.0, 0.2, 0.0], [-0.3, 0.9, 0.1], [0.0, 0.1, 0.8]])
@@ -113,6 +115,57 @@ def test_nothing_is_recorded_for_a_gradient():
     states = rollout(lambda observation, action, step: weight * observation + action, torch.zeros(1), actions, 2)
     returns = particle_returns(states, actions, lambda x, u, after: (weight * after).sum(-1))
     assert not states.requires_grad and not returns.requires_grad
+
+
+@pytest.mark.parametrize("risk", ["mean", "mean-std", "cvar", "worst", "best"])
+def test_a_scores_gradient_is_that_of_its_value(risk):
+    """By the actions and the start, with particles that terminate at different times, against central differences.
+
+    What comes after a termination has no part in it; when it comes is piecewise constant.
+    """
+    a, b = torch.tensor(A), torch.tensor(B)
+    drift = torch.randn(5, 1, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    places = torch.tensor(START), torch.tensor(ACTIONS)
+
+    def terminated(after):
+        return after[..., 1] > 1.5
+
+    def sampler(observation, action, step):
+        return observation @ a.T + action @ b.T + 0.5 * drift
+
+    def value_of(start, actions):
+        measure = RiskMeasure(risk, cvar_share=0.5)
+        return rollout_objective(sampler, quadratic_reward, start, 5, terminated, measure)(actions).sum()
+
+    with torch.no_grad():
+        states = rollout(sampler, *places, 5)
+    ends = terminated(states[1:]).any(0)
+    assert ends.any() and not ends.all()
+    variables = [place.clone().requires_grad_() for place in places]
+    value = value_of(*variables)
+    assert value.item() == value_of(*places).item()
+    for place, gradient, variable in zip(places, torch.autograd.grad(value, variables), variables, strict=True):
+        known = torch.zeros_like(place)
+        for index in range(place.numel()):
+            shift = torch.zeros_like(place)
+            shift.view(-1)[index] = 1e-5
+            up, down = ([each + shift * sign if each is place else each for each in places] for sign in (1, -1))
+            known.view(-1)[index] = (value_of(*up) - value_of(*down)) / 2e-5
+        torch.testing.assert_close(gradient, known, rtol=1e-7, atol=1e-7)
+        assert variable.grad is None
+
+
+def test_a_world_that_records_no_gradient_is_refused():
+    """One that steps and one that gives trajectories, and which it is."""
+    plans = torch.zeros(3, 4, 2, requires_grad=True)
+
+    class Numpy:
+        def __call__(self, observation, action, step):
+            return torch.from_numpy(observation.detach().numpy() + action.detach().numpy())
+
+    for sampler in (Numpy(), InOneGo(torch.zeros(5, 2, 3, 2))):
+        with pytest.raises(NotDifferentiableError, match=rf"^{type(sampler).__name__} has no gradients.*cem"):
+            rollout(sampler, torch.zeros(2), plans, 2)
 
 
 def test_the_reward_is_one_call_on_all_steps_with_matching_triples():

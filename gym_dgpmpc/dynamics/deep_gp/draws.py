@@ -17,8 +17,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gym_dgpmpc.autograd import is_asked
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.deep_gp.compiled_rollout import CompiledRollout, PathwiseLayer
+from gym_dgpmpc.dynamics.deep_gp.derivatives import Derivatives, Step, Trajectories
+from gym_dgpmpc.dynamics.gaussian_draws import root
 from gym_dgpmpc.dynamics.noise import ObservationNoise, PathNoise
 from gym_dgpmpc.gp.deep_gp import Factorised
 from gym_dgpmpc.gp.features import draw_features
@@ -85,7 +88,7 @@ class ConditionalSampler:
         noise = torch.randn(shape, generator=self._generator, dtype=x.dtype, device=x.device)
         if not self._joint:
             mean, variance = conditional(layer, factor, v, x)
-            return mean + variance.sqrt().unsqueeze(-1) * noise
+            return mean + root(variance).unsqueeze(-1) * noise
         mean, covariance = joint_conditional(layer, factor, v, x)
         return mean + cholesky(covariance, layer.variance[:, None, None]) @ noise
 
@@ -157,6 +160,8 @@ def _draw_layer(
 class PathwiseSampler:
     """The draw `pathwise`: P functions (or P per step), evaluated with matrix products and elementwise maps only.
 
+    Steps and trajectories are differentiable; the values are the same whether or not a gradient is recorded.
+
     Args:
         posterior: one whitened sample per particle.
         coordinates: raw states to standardised coordinates and back.
@@ -192,9 +197,35 @@ class PathwiseSampler:
         self.noise: PathNoise | None = None
         if noise is not None:
             self.noise = PathNoise.draw(*noise, horizon, len(whitened[0]), dtype, generator)
+        self._derivatives = Derivatives(self.layers, coordinates, self.noise, by_step=self._by_step)
         self._buffers: _Buffers | None = None
 
     def __call__(
+        self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
+    ) -> Float[Tensor, "P K S"]:
+        if not is_asked(observation, action):
+            return self._step(observation, action, step)
+        return Step.apply(self._step, self._derivatives, observation, action, step)
+
+    def trajectories(
+        self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]
+    ) -> Float[Tensor, "H_plus_1 P K S"]:
+        """The states of every particle under every candidate; what repeated calls give, up to rounding."""
+        if not is_asked(observation, actions):
+            return self._states(observation, actions)
+        return Trajectories.apply(self._states, self._derivatives, observation, actions)
+
+    def _states(
+        self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]
+    ) -> Float[Tensor, "H_plus_1 P K S"]:
+        num_particles = self.layers[0].kernel_out.shape[1]
+        states = observation.new_empty(actions.shape[1] + 1, num_particles, len(actions), len(observation))
+        states[0] = observation
+        for step, action in enumerate(actions.to(observation).transpose(0, 1).contiguous()):
+            states[step + 1] = self._step(states[step], action, step)
+        return states
+
+    def _step(
         self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
         if self.noise is not None:
@@ -247,7 +278,7 @@ class PathwiseSampler:
 
 
 class CompiledPathwiseSampler(PathwiseSampler):
-    """A `PathwiseSampler` that offers whole trajectories in compiled code; float32 on the CPU.
+    """A `PathwiseSampler` whose trajectories are those of compiled code; float32 on the CPU.
 
     Raises:
         RuntimeError: this machine has no compiled code; see `compiled_rollout.is_available`.
@@ -266,22 +297,12 @@ class CompiledPathwiseSampler(PathwiseSampler):
         super().__init__(posterior, coordinates, horizon, num_features, refresh, torch.float32, generator, noise)
         self._rollout = CompiledRollout(self.layers, coordinates, self.noise)
 
-    def trajectories(
+    def _states(
         self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]
     ) -> Float[Tensor, "H_plus_1 P K S"]:
-        """The states of every particle under every candidate; see `CompiledRollout`."""
         if observation.dtype == torch.float64 and self.coordinates.encoder.spec.body_frame:
-            return self._step_by_step(observation, actions)  # a vector far from zero cannot be turned in float32
+            return super()._states(observation, actions)  # a vector far from zero cannot be turned in float32
         return self._rollout(observation, actions)
-
-    def _step_by_step(
-        self, observation: Float[Tensor, "S"], actions: Float[Tensor, "K H A"]
-    ) -> Float[Tensor, "H_plus_1 P K S"]:
-        num_particles = self.layers[0].kernel_out.shape[1]
-        states = [observation.expand(num_particles, len(actions), -1)]
-        for step, action in enumerate(actions.unbind(1)):
-            states.append(self(states[-1], action, step))
-        return torch.stack(states)
 
 
 class _Buffers(NamedTuple):

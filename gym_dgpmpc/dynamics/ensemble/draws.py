@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gym_dgpmpc.autograd import grad_if_asked
 from gym_dgpmpc.dynamics.coordinates import Coordinates
 from gym_dgpmpc.dynamics.ensemble.network import Ensemble, predict
 from gym_dgpmpc.dynamics.gaussian_draws import Gaussian, normals_like
@@ -42,7 +43,7 @@ class EnsembleSampler:
         self._network, self._coordinates, self._generator, self._shuffle = network, coordinates, generator, shuffle
         self._noise_scale = noise_share.sqrt()
 
-    @torch.no_grad()
+    @grad_if_asked
     def __call__(
         self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
@@ -52,7 +53,7 @@ class EnsembleSampler:
             order = chance.argsort(0).unsqueeze(-1)
             x = x.gather(0, order.expand_as(x))
         mean, logvar = predict(self._network, x.reshape(len(self._network.weights[0]), -1, x.shape[-1]))
-        std = torch.exp(0.5 * logvar).mul_(self._noise_scale)
+        std = torch.exp(0.5 * logvar) * self._noise_scale
         target = mean + std * normals_like(mean, self._generator)
         target = target.view(*x.shape[:2], -1)
         if self._shuffle:

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gym_dgpmpc.autograd import refuse_if_asked
 from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.noise import ObservationNoise
@@ -86,6 +87,8 @@ class MomentMatchingSampler:
             observed, from which the noise's is taken off before a step; at the first step, where nothing is spread yet,
             it is added.
 
+    It has no gradients, and refuses where one is asked for (`NotDifferentiableError`).
+
     Raises:
         ValueError: there are too few particles.
     """
@@ -113,10 +116,10 @@ class MomentMatchingSampler:
         self._blur = blur
         self._carried = encoder.carried.to(inputs.mean)
 
-    @torch.no_grad()
     def __call__(
         self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
+        refuse_if_asked(self, observation, action)  # factors of equal eigenvalues have no derivative
         # Factorisations are batched over the candidates, and fail for all if one of them is not finite.
         actions = action.expand(len(observation), -1, -1)
         points = torch.cat([part.to(self._frame.dtype) for part in (observation, actions)], -1)

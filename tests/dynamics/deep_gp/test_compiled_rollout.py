@@ -22,7 +22,7 @@ from gym_dgpmpc.dynamics.noise import ObservationNoise
 from gym_dgpmpc.gp.deep_gp import factorise_all
 from gym_dgpmpc.gp.kernels import KERNELS, RBF
 from gym_dgpmpc.planning.rollout import rollout
-from gym_dgpmpc.types import ObservationSpec, TrajectorySampler, Transitions
+from gym_dgpmpc.types import ObservationSpec, Transitions
 from tests.oracles.models import chains, make_model, normal, seeded
 
 HORIZON, PARTICLES = 6, 3
@@ -268,7 +268,7 @@ def test_a_kernel_that_the_compiled_code_does_not_have_is_left_to_pytorch(monkey
             worlds.append(model.draw(2, 3, seeded()))
         said = [str(warning.message) for warning in caught]
         assert len(said) == 2 * (len(worlds) == 1) and all("kernel 'own'" in text for text in said)
-        assert not isinstance(worlds[-1], TrajectorySampler)
+        assert not isinstance(worlds[-1], CompiledPathwiseSampler)
     states = [world(observation.expand(2, -1, -1).clone(), observation[:, :2], 0) for world in worlds]
     assert all(torch.equal(states[0], other) for other in states[1:])
 
@@ -410,7 +410,7 @@ def test_the_model_draws_compiled_worlds_and_plans_alike_without(refresh, add_no
         )
         model.fit(data, seeded(1))
         world = model.draw(PARTICLES, HORIZON, seeded(2))
-        assert isinstance(world, TrajectorySampler) == compile
+        assert isinstance(world, CompiledPathwiseSampler) == compile
         results.append(rollout(world, observation[0], normal(seeded(4), 50, HORIZON, 2).float(), PARTICLES))
     torch.testing.assert_close(results[0], results[1], rtol=1e-3, atol=1e-3)
 
@@ -421,4 +421,4 @@ def test_double_precision_is_rolled_out_by_pytorch():
     )
     observation = normal(seeded(), 10, 3).float()
     model.fit(Transitions(observation, observation[:, :2], observation), seeded())
-    assert not isinstance(model.draw(2, 3, seeded()), TrajectorySampler)
+    assert not isinstance(model.draw(2, 3, seeded()), CompiledPathwiseSampler)
