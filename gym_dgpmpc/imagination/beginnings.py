@@ -93,7 +93,7 @@ class Plausible(NamedTuple):
         low[never_moved], high[never_moved] = -torch.inf, torch.inf
         return cls(low, high)
 
-    def left(self, observation: Float[Tensor, "n S"]) -> Bool[Tensor, " n"]:
+    def left(self, observation: Float[Tensor, "*b S"]) -> Bool[Tensor, "*b"]:
         """Whether a state is beyond the range, or not finite."""
         inside = (observation >= self.low) & (observation <= self.high) & observation.isfinite()
         return ~inside.all(-1)

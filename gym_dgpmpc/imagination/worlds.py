@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 from gymnasium import spaces
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from torch import Tensor
@@ -108,13 +108,13 @@ class ImaginedVecEnv(VecEnv):
         self._beginnings, self._plausible = beginnings, plausible
         is_dict = isinstance(observation_space, spaces.Dict)
         parts = layout_of(observation_space).values() if is_dict else ()
-        self._observation_size = max(part.stop for part in parts) if is_dict else flat_size(observation_space)
-        self._size = self._observation_size if size is None else size
+        self.observation_size = max(part.stop for part in parts) if is_dict else flat_size(observation_space)
+        self._size = self.observation_size if size is None else size
         self._low, self._high = (
             torch.as_tensor(bound, dtype=dtype, device=device).flatten()
             for bound in (action_space.low, action_space.high)
         )
-        self._generator = torch.Generator(device).manual_seed(fresh_seed() if seed is None else seed)
+        self.generator = torch.Generator(device).manual_seed(fresh_seed() if seed is None else seed)
         self._sampler: TransitionSampler | None = None
         self._step = 0  # of the worlds
         self._states = self._low.new_zeros(num_worlds, self._size)
@@ -174,7 +174,7 @@ class ImaginedVecEnv(VecEnv):
     def reset(self) -> VecEnvObs:
         """Draw all worlds anew, and begin an episode in each; after `seed`, those of that seed."""
         if self._seeds[0] is not None:
-            self._generator.manual_seed(self._seeds[0])
+            self.generator.manual_seed(self._seeds[0])
         self._reset_seeds()
         self._reset_options()
         self._draw_worlds()
@@ -197,7 +197,7 @@ class ImaginedVecEnv(VecEnv):
             raise RuntimeError("call reset before the first step: no worlds are drawn yet")
         before = self._states
         after = self._sampler(before.unsqueeze(1), self._actions.unsqueeze(1), self._step).squeeze(1)
-        left = self._left(after)
+        left = self.left(after)
         after = torch.where(left.unsqueeze(-1), before, after)
         reward = self.reward_fn(before, self._actions, after).to(before)
         left |= ~reward.isfinite()
@@ -244,28 +244,35 @@ class ImaginedVecEnv(VecEnv):
 
     def _draw_worlds(self) -> None:
         with torch.no_grad():
-            self._sampler = self.dynamics.draw(self.num_envs, self.episode_steps, self._generator)
+            self._sampler = self.dynamics.draw(self.num_envs, self.episode_steps, self.generator)
         self._step = 0
 
     def _begin(self, where: np.ndarray) -> None:
         """Begin an episode in these worlds."""
-        observation = self._beginnings(int(where.sum()), self._generator).to(self._states)
         states = self._states.clone()
-        chosen = torch.from_numpy(where).to(states.device)
-        states[chosen] = torch.nn.functional.pad(observation, (0, self._size - self._observation_size))
+        states[torch.from_numpy(where).to(states.device)] = self.starts(int(where.sum()))
         self._states = states
         self._returns[where], self._lengths[where] = 0.0, 0
 
-    def _left(self, after: Float[Tensor, "n S_all"]) -> Tensor:
+    def starts(self, count: int) -> Float[Tensor, "count S_all"]:
+        """States at which episodes begin."""
+        observation = self._beginnings(count, self.generator).to(self._low)
+        return torch.nn.functional.pad(observation, (0, self._size - self.observation_size))
+
+    def unscaled(self, action: Float[Tensor, "*b A"]) -> Float[Tensor, "*b A"]:
+        """Actions within their bounds, from such in [-1, 1]."""
+        return self._low + 0.5 * (action.to(self._low) + 1.0) * (self._high - self._low)
+
+    def left(self, after: Float[Tensor, "*b S_all"]) -> Bool[Tensor, "*b"]:
         """Which states are none that an episode can go on from."""
         left = ~after.isfinite().all(-1)
         if self._plausible is not None:
-            left = left | self._plausible.to(after).left(after[:, : self._observation_size])
+            left = left | self._plausible.to(after).left(after[..., : self.observation_size])
         return left
 
     def _observed(self, states: Float[Tensor, "n S_all"]) -> VecEnvObs:
         """What the environment would show of the states."""
-        return unflattened(states[:, : self._observation_size].cpu().numpy(), self.observation_space)
+        return unflattened(states[:, : self.observation_size].cpu().numpy(), self.observation_space)
 
     def _info(self, last: VecEnvObs, index: int, terminated: bool, lost: bool) -> dict[str, Any]:
         """What Stable-Baselines3 is to know of an episode that has ended."""
