@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
 
 from benchmarks.tasks import Task
-from gym_dgpmpc.agents import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent, presets
+from gym_dgpmpc.agents import DGPMPCAgent, GPMPCAgent, MixtureMPCAgent, MPCAgent, PETSAgent, presets
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.planning import PLANNERS, planner_factory
@@ -190,6 +190,11 @@ def _planning(task: Task) -> Mapping[str, Any]:
     return _of(presets.PAPER, presets.STOCK, presets.DEEP_GP)(task)
 
 
+def _mixed(task: Task) -> Mapping[str, Any]:
+    """As the deep Gaussian process alone, with PETS's networks beside it, which are trained to their optimum."""
+    return presets.for_mixture(_planning(task), presets.NETWORKS.get(task.preset, {}))
+
+
 def _planning_alone(task: Task) -> Mapping[str, Any]:
     names = inspect.signature(true_dynamics_agent).parameters
     return {name: value for name, value in _planning(task).items() if name in names}
@@ -246,6 +251,7 @@ ALL_METHODS: tuple[Method, ...] = (
         for draw in ("MM", "DS")
         for name, noise in (("", False), (" with noise", True))
     ),
+    PlanningMethod("DGP L=2 and PETS", MixtureMPCAgent, _mixed, {"ensemble_half_precision": True}),
     PlanningMethod("true dynamics", true_dynamics_agent, _planning_alone),
     ModelFreeMethod("SAC", SAC, _off_policy),
     ModelFreeMethod("TD3", TD3, lambda task: {**_off_policy(task), "exploration_noise": TD3_NOISE}),

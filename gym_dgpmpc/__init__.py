@@ -8,8 +8,10 @@ if TYPE_CHECKING:
     from gym_dgpmpc.agents import DGPMPCAgent as DGPMPCAgent
     from gym_dgpmpc.agents import DynaAgent as DynaAgent
     from gym_dgpmpc.agents import GPMPCAgent as GPMPCAgent
+    from gym_dgpmpc.agents import MixtureMPCAgent as MixtureMPCAgent
     from gym_dgpmpc.agents import MPCAgent as MPCAgent
     from gym_dgpmpc.agents import PETSAgent as PETSAgent
+    from gym_dgpmpc.agents.presets import mixture_settings_for as mixture_settings_for
     from gym_dgpmpc.agents.presets import settings_for as settings_for
     from gym_dgpmpc.envs.registration import *  # noqa: F403
     from gym_dgpmpc.imagination import ImaginedVecEnv as ImaginedVecEnv
@@ -17,8 +19,10 @@ if TYPE_CHECKING:
 
 # Public name -> the module it is imported from on first use, so that `import gym_dgpmpc` stays light.
 _MODULE_OF = {
-    **dict.fromkeys(("DGPMPCAgent", "DynaAgent", "GPMPCAgent", "MPCAgent", "PETSAgent"), "gym_dgpmpc.agents"),
-    "settings_for": "gym_dgpmpc.agents.presets",
+    **dict.fromkeys(
+        ("DGPMPCAgent", "DynaAgent", "GPMPCAgent", "MPCAgent", "MixtureMPCAgent", "PETSAgent"), "gym_dgpmpc.agents"
+    ),
+    **dict.fromkeys(("settings_for", "mixture_settings_for"), "gym_dgpmpc.agents.presets"),
     "ImaginedVecEnv": "gym_dgpmpc.imagination",
     "RiskSensitiveReward": "gym_dgpmpc.wrappers",
     **CLASSES,

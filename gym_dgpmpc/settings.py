@@ -9,7 +9,8 @@ new setting is an edit of its part alone.
 import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from gym_dgpmpc.checks import closest
@@ -54,10 +55,12 @@ def settings_of(part: Callable[..., Any]) -> dict[str, Setting]:
     """The settings of a class, those of the classes in its ``composed_of`` included.
 
     A class may name in ``largest`` (a mapping) what a file may hold at most, and in ``unsaved`` which of its settings
-    no file holds.
+    no file holds. Of the parts in its ``members_by_name`` (a mapping), which have settings of the same names, each is
+    under the part's name and its own: "deep_gp_num_layers". A `partial` of a class is the class with other defaults.
     """
-    texts = argument_texts(inspect.getdoc(part) or "")
-    largest, unsaved = getattr(part, "largest", {}), getattr(part, "unsaved", ())
+    made = part.func if isinstance(part, partial) else part
+    texts = argument_texts(inspect.getdoc(made) or "")
+    largest, unsaved = getattr(made, "largest", {}), getattr(made, "unsaved", ())
     found = {
         parameter.name: Setting(
             parameter.name,
@@ -70,11 +73,19 @@ def settings_of(part: Callable[..., Any]) -> dict[str, Setting]:
         for parameter in inspect.signature(part).parameters.values()
         if parameter.default is not parameter.empty
         and parameter.name not in GIVEN_BY_THE_AGENT
-        and (parameter.kind is parameter.KEYWORD_ONLY or _is_dataclass_field(part, parameter.name))
+        and (parameter.kind is parameter.KEYWORD_ONLY or _is_dataclass_field(made, parameter.name))
     }
-    for other in getattr(part, "composed_of", ()):
+    for other in getattr(made, "composed_of", ()):
         found = joined(found, settings_of(other))
+    for name, member in getattr(made, "members_by_name", {}).items():
+        own = [replace(setting, name=of_member(name, setting.name)) for setting in settings_of(member).values()]
+        found = joined(found, {setting.name: setting for setting in own})
     return found
+
+
+def of_member(name: str, setting: str) -> str:
+    """What a setting, or another value, of one of several parts is called: deep_gp_kernel of "deep-gp" and "kernel"."""
+    return f"{name.replace('-', '_')}_{setting}"
 
 
 def joined(*of_parts: Settings) -> dict[str, Setting]:

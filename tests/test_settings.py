@@ -1,6 +1,7 @@
 """Settings are read from the one place where they are named, documented and defaulted."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import pytest
 
@@ -8,7 +9,7 @@ from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
 from gym_dgpmpc.dynamics.ensemble import EnsembleDynamics
 from gym_dgpmpc.dynamics.sparse_gp import SparseGPDynamics
 from gym_dgpmpc.planning import CEM
-from gym_dgpmpc.settings import LARGEST_NUMBER, argument_texts, joined, refuse_unknown, settings_of
+from gym_dgpmpc.settings import LARGEST_NUMBER, argument_texts, joined, of_member, refuse_unknown, settings_of
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,30 @@ class Model:
         self, size: int, spec=None, *, width: int = 3, low: float = 0.0, high: float = 1.0, device="cpu", **sampler
     ):
         pass
+
+
+def test_members_have_their_settings_under_their_names():
+    """With the limits that they have themselves, and with the defaults of a partial."""
+
+    class Pair:
+        """Two of them.
+
+        Args:
+            ratio: of the two.
+        """
+
+        members_by_name = {"first-model": Model, "second": partial(Model, width=5)}  # noqa: RUF012
+
+        def __init__(self, *, ratio: float = 1.0, **settings):
+            pass
+
+    found, own = settings_of(Pair), settings_of(Model)
+    named = [f"{member}_{name}" for member in ("first_model", "second") for name in own]
+    assert list(found) == ["ratio", *named]
+    assert found["first_model_width"] == replace(own["width"], name="first_model_width")
+    assert found["second_width"] == replace(own["width"], name="second_width", default=5)
+    assert not found["second_high"].is_saved
+    assert of_member("first-model", "step_size") == "first_model_step_size" in found
 
 
 def test_settings_are_keyword_arguments_with_a_default_and_those_of_the_classes_it_is_composed_of():

@@ -5,6 +5,7 @@ the policy"), and two of random actions that were never learned from ("off").
 """
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,10 @@ import torch
 from benchmarks.calibration.episodes import DATA, SMOOTH, TASKS, WHITE, load, observation_spec, spread
 from benchmarks.calibration.models import Make
 from benchmarks.calibration.scores import forecast, scores
-from gym_dgpmpc.agents.presets import DEEP_GP, NETWORKS
+from gym_dgpmpc.agents.presets import DEEP_GP, NETWORKS, for_mixture
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
+from gym_dgpmpc.dynamics.mixture.model import MixtureDynamics
 
 HORIZONS = {"cartpole": (1, 10, 20), "pendulum": (1, 10, 20), "reacher": (1, 10, 20), "cheetah": (1, 10, 20, 40)}
 
@@ -28,9 +30,7 @@ def measure(
     """A row of scores for each number of episodes, test and horizon."""
     recording, spec, unit = load(task, seed, data), observation_spec(task), spread(task, data)
     sizes = recording.observation.shape[-1], recording.action.shape[-1]
-    for of_class, presets in ((EnsembleDynamics, NETWORKS), (DeepGPDynamics, DEEP_GP)):
-        if getattr(make, "func", None) is of_class:
-            settings = {**presets.get(TASKS[task], {}), **settings}
+    settings = {**_presets(make, TASKS[task]), **settings}
     model, generator = make(*sizes, spec, **settings), torch.Generator().manual_seed(seed)
     predicted = model.encoder.predicted
     rows: list[dict[str, Any]] = []
@@ -51,3 +51,15 @@ def measure(
                     | {"fit_seconds": seconds, "noise_std": float(metrics.get("noise_std", float("nan")))}
                 )
     return rows
+
+
+def _presets(make: Make, env_id: str) -> Mapping[str, Any]:
+    """What is set for the model on a task."""
+    of_deep_gp: Mapping[str, Any] = DEEP_GP.get(env_id, {})
+    of_ensemble: Mapping[str, Any] = NETWORKS.get(env_id, {})
+    of_class: dict[Any, Mapping[str, Any]] = {
+        DeepGPDynamics: of_deep_gp,
+        EnsembleDynamics: of_ensemble,
+        MixtureDynamics: for_mixture(of_deep_gp, of_ensemble),
+    }
+    return of_class.get(getattr(make, "func", None), {})

@@ -6,9 +6,10 @@ from functools import partial
 from benchmarks.methods import OPTIMUM
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
+from gym_dgpmpc.dynamics.mixture.model import MixtureDynamics
 from gym_dgpmpc.dynamics.sparse_gp.model import SparseGPDynamics
 
-Make = Callable[..., DeepGPDynamics | EnsembleDynamics | SparseGPDynamics]
+Make = Callable[..., DeepGPDynamics | EnsembleDynamics | SparseGPDynamics | MixtureDynamics]
 
 MODELS: dict[str, Make] = {
     "DGP L=1": partial(DeepGPDynamics, num_layers=1),
@@ -19,4 +20,5 @@ MODELS: dict[str, Make] = {
     "sparse GP": partial(SparseGPDynamics),
     "sparse GP with noise": partial(SparseGPDynamics, add_noise=True),
     "exact GP": partial(SparseGPDynamics, exact=True),
+    "DGP L=2 and PETS": partial(MixtureDynamics),
 }

@@ -3,7 +3,8 @@
 from gym_dgpmpc.agents.dgp_mpc import DGPMPCAgent
 from gym_dgpmpc.agents.dyna import DynaAgent
 from gym_dgpmpc.agents.gp_mpc import GPMPCAgent
+from gym_dgpmpc.agents.mixture import MixtureMPCAgent
 from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.agents.pets import PETSAgent
 
-__all__ = ["DGPMPCAgent", "DynaAgent", "GPMPCAgent", "MPCAgent", "PETSAgent"]
+__all__ = ["DGPMPCAgent", "DynaAgent", "GPMPCAgent", "MPCAgent", "MixtureMPCAgent", "PETSAgent"]

@@ -8,7 +8,6 @@ from typing import Any
 
 from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.dynamics.ensemble import EnsembleDynamics
-from gym_dgpmpc.types import DynamicsModel, ObservationSpec
 
 
 class PETSAgent(MPCAgent):
@@ -32,17 +31,3 @@ class PETSAgent(MPCAgent):
 
     def __init__(self, *args: Any, num_particles: int = 20, **settings: Any):
         super().__init__(*args, num_particles=num_particles, **settings)
-
-    def _make_dynamics(
-        self, observation_size: int, action_size: int, observation_spec: ObservationSpec
-    ) -> DynamicsModel | None:
-        draw, members, particles = (
-            self.settings["draw"],
-            self.settings["num_members"],
-            self._planning_given.num_particles,
-        )
-        if draw in ("TS1", "TSinf") and particles % members:
-            raise ValueError(
-                f"the draw {draw} needs a multiple of num_members = {members} as num_particles, got {particles}"
-            )
-        return super()._make_dynamics(observation_size, action_size, observation_spec)

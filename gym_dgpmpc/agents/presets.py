@@ -4,6 +4,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
+from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.settings import of_member, settings_of
+
 
 def _paper(horizon: int, num_iterations: int, actions_per_plan: int) -> MappingProxyType[str, Any]:
     """What the paper holds fixed over its tasks, and what it does not."""
@@ -163,3 +166,22 @@ COMPARISON_GP = MappingProxyType(
     {env_id: MappingProxyType({**settings, "num_inducing": 200}) for env_id, settings in PAPER.items()}
 )
 """`GPMPCAgent` as in the comparison of Gadd et al.: their planning and number of inducing points."""
+
+
+def for_mixture(of_deep_gp: Mapping[str, Any], of_ensemble: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Settings of a `DGPMPCAgent`, or of its model, and of an ensemble as those of a mixture of both models.
+
+    What is no setting of the deep Gaussian process, such as the planner's, stays as it is.
+    """
+    known = settings_of(DeepGPDynamics)
+    mixed = {of_member("deep-gp", name) if name in known else name: value for name, value in of_deep_gp.items()}
+    return mixed | {of_member("ensemble", name): value for name, value in of_ensemble.items()}
+
+
+def mixture_settings_for(env_id: str) -> Mapping[str, Any]:
+    """Settings of `MixtureMPCAgent` for a task: those of `settings_for`, and PETS's networks, as far as there are any.
+
+    Args:
+        env_id: as in `settings_for`.
+    """
+    return for_mixture(settings_for(env_id), NETWORKS.get(env_id.rpartition(":")[2], {}))

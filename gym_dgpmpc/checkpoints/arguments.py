@@ -25,6 +25,7 @@ AGENT_CLASSES = {
     "GPMPCAgent": "gym_dgpmpc.agents.gp_mpc",
     "PETSAgent": "gym_dgpmpc.agents.pets",
     "DynaAgent": "gym_dgpmpc.agents.dyna",
+    "MixtureMPCAgent": "gym_dgpmpc.agents.mixture",
 }
 """The classes that a file may name, and where they are; nothing else is ever imported for a file."""
 

@@ -7,17 +7,23 @@ import pytest
 import torch
 
 import gym_dgpmpc
-from gym_dgpmpc import GPMPCAgent, MPCAgent, PETSAgent
+from gym_dgpmpc import GPMPCAgent, MixtureMPCAgent, MPCAgent, PETSAgent
 from gym_dgpmpc.agents import presets
 from gym_dgpmpc.errors import CheckpointError
 from gym_dgpmpc.types import ObservationSpec
 from tests.agents.point_mass import LENGTH, KnownPointMass, actions_of
 
 PLANNING = {"horizon": 4, "num_candidates": 30, "num_iterations": 2, "seed": 0}
+SMALL_NETWORKS = {"num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4), "num_epochs": 5}
+SMALL_DEEP_GP = {
+    "num_inducing": 8, "num_features": 32, "first_training_iterations": 30, "training_iterations": 10, "num_samples": 6,
+    "sample_spacing": 2, "resample_samples": 1,
+}  # fmt: skip
 TINY = {
-    PETSAgent: {"num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4), "num_particles": 5, **PLANNING},
+    PETSAgent: {**SMALL_NETWORKS, "num_particles": 5, **PLANNING},
     GPMPCAgent: {"num_inducing": 8, "max_training_iterations": 10, "num_particles": 4, **PLANNING},
 }
+TINY[MixtureMPCAgent] = {**presets.for_mixture(SMALL_DEEP_GP, SMALL_NETWORKS), "num_particles": 5, **PLANNING}
 AGENTS = list(TINY)
 SETTINGS = [
     *((PETSAgent, {"draw": draw}) for draw in ("TS1", "TSinf", "DS", "MM", "expectation")),
@@ -25,6 +31,10 @@ SETTINGS = [
                  "weight_decay": (1e-4, 1e-4, 1e-4), "learning_rate": 1e-2, "actions_per_plan": 2}),
     *((GPMPCAgent, {"draw": draw}) for draw in ("DS", "MM", "AMM")),
     (GPMPCAgent, {"kernel": "matern32", "exact": True, "add_noise": True, "update_within_episode": True}),
+    (MixtureMPCAgent, {"members": ("deep-gp", "ensemble")}),
+    (MixtureMPCAgent, {"members": ("sparse-gp", "ensemble", "deep-gp"), "sparse_gp_num_inducing": 8, "score_every": 2,
+                       "sparse_gp_max_training_iterations": 10,
+                       "ensemble_draw": "TS1", "num_particles": 3}),
 ]  # fmt: skip
 
 
@@ -79,7 +89,6 @@ def test_the_cart_pole_by_its_id(agent_class, tmp_path):
 @pytest.mark.parametrize(
     ("agent_class", "arguments", "message"),
     [
-        (PETSAgent, {"num_particles": 7}, "TSinf needs a multiple of num_members = 5 as num_particles, got 7"),
         (PETSAgent, {"weight_decay": (1e-4,)}, "weight_decay must hold one number"),
         (PETSAgent, {"learning_rate": -1.0}, "learning_rate must be positive, received -1.0"),
         (PETSAgent, {"num_elites": 31}, "num_elites .*31 of 30"),
@@ -95,11 +104,14 @@ def test_settings_out_of_range_are_named(agent_class, arguments, message):
         tiny(agent_class, **arguments)
 
 
-def test_any_number_of_particles_will_do_where_no_network_is_chosen():
-    assert tiny(PETSAgent, draw="DS", num_particles=7).num_particles == 7
-
-
-@pytest.mark.parametrize(("agent_class", "other"), [(PETSAgent, {"hidden_size": 9}), (GPMPCAgent, {"num_inducing": 5})])
+@pytest.mark.parametrize(
+    ("agent_class", "other"),
+    [
+        (PETSAgent, {"hidden_size": 9}),
+        (GPMPCAgent, {"num_inducing": 5}),
+        (MixtureMPCAgent, {"ensemble_hidden_size": 9}),
+    ],
+)
 def test_a_file_of_other_settings_does_not_load_silently(agent_class, other, tmp_path):
     tiny(agent_class).learn(LENGTH + 2).save(tmp_path / "agent")
     with pytest.raises(CheckpointError, match="does not fit"):
@@ -146,4 +158,4 @@ def test_an_evaluated_run_is_the_run_itself():
 
 
 def test_the_package_exports_them():
-    assert {"PETSAgent", "GPMPCAgent"} <= set(dir(gym_dgpmpc))
+    assert {"PETSAgent", "GPMPCAgent", "MixtureMPCAgent"} <= set(dir(gym_dgpmpc))

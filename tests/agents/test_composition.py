@@ -11,7 +11,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.policies import BasePolicy
 
-from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, MPCAgent, PETSAgent
+from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, MixtureMPCAgent, MPCAgent, PETSAgent
+from gym_dgpmpc.agents.presets import for_mixture
 from gym_dgpmpc.checkpoints.format import read_checkpoint
 from gym_dgpmpc.errors import CheckpointError
 from gym_dgpmpc.planning import CEM, PLANNERS, register_planner
@@ -23,7 +24,7 @@ from tests.agents.test_dgp_mpc import TINY
 from tests.checkpoints.common import changed, load
 from tests.planning.toy_planners import RandomShooting
 
-NAMED = (DGPMPCAgent, GPMPCAgent, PETSAgent)
+NAMED = (DGPMPCAgent, GPMPCAgent, MixtureMPCAgent, PETSAgent)
 NOT_SAVED = {
     "policy",
     "env",
@@ -32,6 +33,7 @@ NOT_SAVED = {
     "first_controller",
     "device",
     "compile",
+    "deep_gp_compile",
     "dynamics",
     "settings",
 }
@@ -185,7 +187,9 @@ def test_callbacks_see_what_stable_baselines3s_algorithms_show():
 @pytest.mark.parametrize("agent_class", NAMED)
 def test_any_planner_by_name(agent_class, shooting, tmp_path):
     """Its settings are arguments and are saved; those of CEM are unknown then."""
-    sizes = TINY if agent_class is DGPMPCAgent else {"learning_starts": LENGTH, "num_particles": 5, "seed": 0}
+    sizes = {
+        DGPMPCAgent: TINY, MixtureMPCAgent: for_mixture(TINY, {"hidden_size": 8, "num_epochs": 5}),
+    }.get(agent_class, {"learning_starts": LENGTH, "num_particles": 5, "seed": 0})  # fmt: skip
     sizes = {name: value for name, value in sizes.items() if name not in settings_of(CEM)}
     made = agent_class(KnownPointMass(), planner=shooting, horizon=3, num_candidates=7, **sizes).learn(LENGTH + 2)
     assert isinstance(made.planner, RandomShooting) and made.controller.horizon == 3

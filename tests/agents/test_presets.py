@@ -6,7 +6,7 @@ import inspect
 import gymnasium
 import pytest
 
-from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, PETSAgent
+from gym_dgpmpc import DGPMPCAgent, GPMPCAgent, MixtureMPCAgent, PETSAgent
 from gym_dgpmpc.agents import presets
 from gym_dgpmpc.planning import PLANNERS
 
@@ -37,6 +37,24 @@ def test_settings_are_found_by_id():
     assert presets.settings_for(with_module) == presets.STOCK["FetchReachDense-v4"]
     assert presets.settings_for("ToyPush-v0") == {}
     assert not set(presets.PAPER) & set(presets.STOCK)
+
+
+def test_a_mixture_has_the_presets_of_its_members():
+    """Each under its member's name; what is the planner's is the planner's."""
+    own = presets.NETWORKS["VelocityHalfCheetah-v0"]
+    assert presets.mixture_settings_for("VelocityHalfCheetah-v0") == {
+        **presets.PAPER["VelocityHalfCheetah-v0"], "deep_gp_linear": True, "deep_gp_first_training_iterations": 300,
+        **{f"ensemble_{name}": value for name, value in own.items()},
+    }  # fmt: skip
+    stock = dict(presets.STOCK["FetchReachDense-v4"])
+    members = {f"deep_gp_{name}": stock.pop(name) for name in ("num_layers", "num_inducing")}
+    with_module = "gym_dgpmpc.envs.robotics:FetchReachDense-v4"
+    assert presets.mixture_settings_for(with_module) == {**stock, **members}
+    for env_id in ("ModCartPole-v0", "Pendulum-v1", "BiasedReacher-v0"):
+        agent = MixtureMPCAgent(gymnasium.make(env_id), **presets.mixture_settings_for(env_id), seed=0)
+        alone = DGPMPCAgent(gymnasium.make(env_id), **presets.settings_for(env_id), seed=0)
+        assert type(agent.planner) is type(alone.planner) and agent.horizon == alone.horizon
+        assert agent.dynamics.models["deep-gp"].kernel is alone.dynamics.kernel
 
 
 TABLES = {

@@ -9,21 +9,24 @@ from pathlib import Path
 import gymnasium
 
 from benchmarks.tasks import Task
+from gym_dgpmpc.agents.presets import for_mixture
 from tests.runs.toy import EPISODE_STEPS, SMALLEST_AGENT, ToyPush
 
-NETWORKS = {"num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4), "num_particles": 5}
+NETWORKS = {"num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4)}
 PLANNING = {"horizon": 3, "num_candidates": 6, "num_elites": 2, "num_iterations": 1}
+PETS = NETWORKS | PLANNING | {"num_particles": 5}
 OFF_POLICY = {"batch_size": 4, "buffer_size": 100, "learning_starts": EPISODE_STEPS}
 TINY = {
     "DGP-MPC L=1 matern32": {name: value for name, value in SMALLEST_AGENT.items() if name != "num_layers"},
-    "PETS TS1": NETWORKS | PLANNING,
-    "PETS TSinf": NETWORKS | PLANNING,
-    "PETS TSinf to its optimum": NETWORKS | PLANNING | {"num_epochs": 2, "patience": 1},
-    "PETS as published": NETWORKS | PLANNING,
+    "PETS TS1": PETS,
+    "PETS TSinf": PETS,
+    "PETS TSinf to its optimum": PETS | {"num_epochs": 2, "patience": 1},
+    "PETS as published": PETS,
     "GP-MM": PLANNING | {"num_inducing": 6, "max_training_iterations": 3},
     "GP-DS": PLANNING | {"num_inducing": 6, "max_training_iterations": 3},
     "GP-MM with noise": PLANNING | {"num_inducing": 6, "max_training_iterations": 3},
     "GP-DS with noise": PLANNING | {"num_inducing": 6, "max_training_iterations": 3},
+    "DGP L=2 and PETS": for_mixture(SMALLEST_AGENT, NETWORKS | {"num_epochs": 2}),
     "true dynamics": PLANNING,
     "SAC": OFF_POLICY,
     "TD3": OFF_POLICY,

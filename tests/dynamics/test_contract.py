@@ -13,11 +13,14 @@ import torch
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.ensemble.draws import PROPAGATIONS
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
+from gym_dgpmpc.dynamics.mixture import MixtureDynamics
+from gym_dgpmpc.dynamics.mixture.model import MEMBERS
 from gym_dgpmpc.dynamics.noise import NoiseSplit
 from gym_dgpmpc.dynamics.sparse_gp.model import GP_DRAWS, SparseGPDynamics
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.errors import NotDifferentiableError
 from gym_dgpmpc.planning.rollout import rollout
+from gym_dgpmpc.settings import of_member
 from gym_dgpmpc.types import DynamicsModel, Transitions, TransitionSampler
 from tests.oracles import linear_gaussian, slider
 from tests.oracles.models import seeded
@@ -33,6 +36,12 @@ DEEP = {
     "num_samples": 20, "sample_spacing": 2, "resample_samples": 2, "add_noise": False,
 }  # fmt: skip
 NETWORKS = {"num_members": 5, "num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4)}
+
+MIXED = {
+    "deep-gp": {**DEEP, "first_training_iterations": 50},
+    "sparse-gp": {"num_inducing": 30, "max_training_iterations": 50},
+    "ensemble": {**NETWORKS, "num_epochs": 5},
+}
 
 
 class Case(NamedTuple):
@@ -62,6 +71,8 @@ def _cases():
             settings = {**DEEP, "num_layers": layers, "draw": draw, "refresh": refresh}
             name = f"deep{layers}-{draw}-{refresh}"
             cases[name] = of(f"deep{layers}", DeepGPDynamics, settings, *shape)
+    of_members = {of_member(name, key): value for name, own in MIXED.items() for key, value in own.items()}
+    cases["mixture"] = of("mixture", MixtureDynamics, {"members": tuple(MEMBERS), **of_members}, *shape)
     cases["truth"] = Case("truth", functools.partial(lambda: TrueDynamics(slider.environment())), is_random=False)
     return cases
 
@@ -69,6 +80,9 @@ def _cases():
 CASES = _cases()
 FAMILIES = {case.family: name for name, case in CASES.items()}  # one case of each
 LEARNERS = [name for family, name in FAMILIES.items() if family != "truth"]
+OF_ONE_KIND = [name for name in LEARNERS if name != "mixture"]
+"""Those whose noise is theirs: that of a mixture is its members'."""
+GAUSSIAN_PROCESSES = [name for name, case in CASES.items() if case.family not in ("truth", "ensemble", "mixture")]
 
 
 @functools.cache
@@ -308,7 +322,9 @@ def test_a_state_with_a_hole_is_refused_and_changes_nothing(learner):
     for missing in model.state_dict():
         state = dict(model.state_dict())
         del state[missing]
-        with pytest.raises(ValueError, match=f"'{missing}'.*None"):
+        of_a_member, _, entry = missing.partition(".")
+        shown = rf"'{of_a_member}'.*'{entry}'" if of_a_member in MIXED else f"'{missing}'"
+        with pytest.raises(ValueError, match=rf"{shown}.*None"):
             model.load_state_dict(state)
     assert torch.equal(states_of(model), before)
 
@@ -354,7 +370,7 @@ def test_the_true_dynamics_are_the_linear_system():
         np.testing.assert_allclose(states[:, :, k], np.repeat(mean[:, None], 2, 1), atol=1e-6)
 
 
-@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.family not in ("truth", "ensemble")])
+@pytest.mark.parametrize("name", GAUSSIAN_PROCESSES)
 def test_a_gaussian_process_finds_the_linear_system(name):
     """None of them draws the noise, so only the function's uncertainty is left, which is less than a step's noise:
     the variance of a fit with p degrees of freedom is on average p / N of the noise's, and p is far below N here.
@@ -480,10 +496,7 @@ def variances_with_noise(split, process_variance, forgets_correlations):
     return np.stack(found)
 
 
-NOISY = [name for name, case in CASES.items() if case.family not in ("truth", "ensemble")]
-
-
-@pytest.mark.parametrize("name", NOISY)
+@pytest.mark.parametrize("name", GAUSSIAN_PROCESSES)
 def test_draws_of_a_gaussian_process_with_noise_spread_by_the_recursion(name):
     """Beside their spread without noise, to which it adds, since the system is linear: within four standard errors of
     both variances, each sqrt(2 / P) of it, and a tenth for what is not linear in the fit."""
@@ -502,7 +515,7 @@ def test_draws_of_a_gaussian_process_with_noise_spread_by_the_recursion(name):
     assert (spread[:, 2] == 0).all(), "a constant has no noise"
 
 
-@pytest.mark.parametrize("name", [name for name in NOISY if "MM" not in name])
+@pytest.mark.parametrize("name", [name for name in GAUSSIAN_PROCESSES if "MM" not in name])
 def test_steps_of_a_gaussian_process_keep_within_what_was_seen(name):
     """And one and a half times its range on either side. (`MM` draws anew from the bounded particles' moments.)"""
     model = CASES[name].make(add_noise=True)
@@ -533,6 +546,7 @@ def test_draws_of_an_ensemble_with_noise_spread_by_the_recursion(draw):
     assert states_of(means_alone)[1:].var(1).max() < 1e-10
 
 
+@pytest.mark.parametrize("learner", OF_ONE_KIND)
 def test_what_was_told_apart_is_kept_and_older_states_have_none_of_it(learner):
     model = CASES[learner].make(add_noise=True, split_noise=True)
     model.load_state_dict(trained_state(CASES[learner].family))  # older: all is the process's
@@ -547,6 +561,7 @@ def test_what_was_told_apart_is_kept_and_older_states_have_none_of_it(learner):
         model.load_state_dict({key: value for key, value in model.state_dict().items() if key != "noise.centre"})
 
 
+@pytest.mark.parametrize("trainer", OF_ONE_KIND)
 def test_a_training_says_how_much_noise_of_each_kind_it_found(trainer):
     """Where it is asked to tell them apart; these transitions do not follow one another, so all is the process's."""
     data = slider.transitions(40, NOISE)

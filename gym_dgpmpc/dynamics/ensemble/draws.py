@@ -27,8 +27,9 @@ PROPAGATIONS: tuple[Propagation, ...] = get_args(Propagation)
 class EnsembleSampler:
     """The draws `TSinf` and `TS1`: every particle by one network's mean and variance, fresh noise at each step.
 
-    Particle p belongs to network p // (P / B). With ``shuffle`` the particles of each candidate are permuted before
-    a step and put back after it. Of the variance that a network predicts, ``noise_share`` is drawn.
+    Particle p belongs to network p // (P / B); networks may be copies of each other. With ``shuffle`` the particles of
+    each candidate are permuted before a step and put back after it. Of the variance that a network predicts,
+    ``noise_share`` is drawn.
     """
 
     def __init__(

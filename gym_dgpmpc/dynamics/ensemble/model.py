@@ -193,9 +193,11 @@ class EnsembleDynamics(Learner[_Fitted]):
     def draw(self, num_particles: int, horizon: int, generator: torch.Generator) -> TransitionSampler:
         """Particles for plans of ``horizon`` steps.
 
+        Those of a "TS1" or "TSinf" draw are shared out over the networks; which of these have one more than others, if
+        their number is not a multiple, is drawn once for the plan.
+
         Raises:
             RuntimeError: the model was not fitted.
-            ValueError: the particles of a "TS1" or "TSinf" draw cannot be shared out evenly over the networks.
         """
         fitted = self._require_fit("draw")
         network = Ensemble.from_parameters(
@@ -206,11 +208,8 @@ class EnsembleDynamics(Learner[_Fitted]):
         drawn = self._drawn_noise(fitted.noise)
         share, blur = drawn.process_share.to(self.dtype), drawn.observation(self.encoder)
         if self.draw_kind in ("TS1", "TSinf"):
-            if num_particles < 1 or num_particles % self.num_members:
-                raise ValueError(
-                    f"the draw {self.draw_kind} needs a number of particles that is a multiple of its "
-                    f"{self.num_members} networks, received {num_particles}"
-                )
+            if num_particles % self.num_members:
+                network = network.at(self._pick(num_particles, generator))
             shuffle = self.draw_kind == "TS1" and self.num_members > 1
             by_networks = EnsembleSampler(network, coordinates, generator, shuffle=shuffle, noise_share=share)
             return observed(by_networks, blur, generator)
@@ -219,6 +218,12 @@ class EnsembleDynamics(Learner[_Fitted]):
         collapsed, match_moments = CollapsedEnsemble(network, share), self.draw_kind == "MM"
         sampler = GaussianSampler(collapsed, coordinates, generator, match_moments=match_moments)
         return observed(sampler, blur, generator)
+
+    def _pick(self, num_particles: int, generator: torch.Generator) -> Int[Tensor, "P"]:
+        """A network for each particle, as different as may be."""
+        rounds = -(-num_particles // self.num_members)
+        orders = [torch.randperm(self.num_members, generator=generator, device=self.device) for _ in range(rounds)]
+        return torch.cat(orders)[:num_particles]
 
     def _mixture(self, x: Float[Tensor, "n D"], generator: torch.Generator) -> Mixture:
         fitted = self._require_fit("predict")

@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -44,6 +44,11 @@ class Ensemble(NamedTuple):
         count = sum(name.endswith(".weight") for name in named)
         weights, biases = (tuple(named[f"layers.{i}.{name}"] for i in range(count)) for name in _LAYER_FIELDS)
         return cls(weights, biases, named["max_logvar"], named["min_logvar"])
+
+    def at(self, members: Int[Tensor, "C"]) -> "Ensemble":
+        """Copies of these members, each as often as it is named."""
+        weights, biases = (tuple(value[members] for value in values) for values in (self.weights, self.biases))
+        return self._replace(weights=weights, biases=biases)
 
 
 _LAYER_FIELDS = ("weight", "bias")

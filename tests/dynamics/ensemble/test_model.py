@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from gym_dgpmpc.dynamics.ensemble import network as ensemble_network
+from gym_dgpmpc.dynamics.ensemble.draws import PROPAGATIONS
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
 from gym_dgpmpc.dynamics.ensemble.network import (
     MAX_LOGVAR,
@@ -189,15 +190,25 @@ def test_ds_draws_from_the_mixtures_mean_and_total_variance():
 
 
 @pytest.mark.parametrize("draw", ["TS1", "TSinf"])
-@pytest.mark.parametrize("num_particles", [1, 4, 0])
-def test_particles_that_cannot_be_shared_out_are_an_error(draw, num_particles):
-    with pytest.raises(ValueError, match=rf"{draw} .*particles .*\b3\b.* {num_particles}$"):
-        constant(draw).draw(num_particles, 1, seeded())
+@pytest.mark.parametrize("num_particles", [1, 2, 4])
+def test_particles_that_are_left_over_are_of_networks_at_random(draw, num_particles):
+    """Of three networks each has P // 3 particles or one more: in 150 draws P / 3, with the standard error of a binary
+    number, whose variance is at most 1/4."""
+    model, generator, draws = constant(draw), seeded(3), 150
+    counts = torch.zeros(draws, 3)
+    for count in counts:
+        moved = model.draw(num_particles, 1, generator)(torch.zeros(num_particles, 7, 2), torch.zeros(7, 1), 0)
+        network = moved[..., 0].round().long().sort(0).values
+        assert (network == network[:, :1]).all(), "the same ones for all candidates"
+        count += torch.bincount(network[:, 0], minlength=3)
+    assert set(counts.unique().tolist()) == {num_particles // 3, num_particles // 3 + 1}
+    assert (counts.sum(1) == num_particles).all()
+    assert ((counts.mean(0) - num_particles / 3).abs() < 5 * 0.5 * draws**-0.5).all()
 
 
-def test_any_number_of_particles_will_do_for_the_other_draws():
-    for draw in ("DS", "MM", "expectation"):
-        assert constant(draw).draw(4, 1, seeded())(torch.zeros(4, 2, 2), torch.zeros(2, 1), 0).shape == (4, 2, 2)
+@pytest.mark.parametrize("draw", PROPAGATIONS)
+def test_any_number_of_particles_will_do(draw):
+    assert constant(draw).draw(4, 1, seeded())(torch.zeros(4, 2, 2), torch.zeros(2, 1), 0).shape == (4, 2, 2)
 
 
 def test_half_precision_is_off_by_its_rounding():
