@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from gym_dgpmpc import cli
 from gym_dgpmpc.agents import DGPMPCAgent
 from gym_dgpmpc.agents.exploration import ExplorationName
-from gym_dgpmpc.agents.presets import OF_A_TASK, PLANNING, settings_for
+from gym_dgpmpc.agents.presets import NETWORKS, OF_A_TASK, PLANNING, mixture_settings_for, settings_for
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.checkpoints.format import read_checkpoint
 from gym_dgpmpc.cli import options
@@ -320,15 +320,17 @@ def test_runs_as_a_module():
     assert result.stdout.startswith("dgpmpc ")
 
 
-def test_every_plain_setting_is_an_option(run):
+@pytest.mark.parametrize("agent", options.AGENTS)
+def test_every_plain_setting_is_an_option(run, agent):
     """Called as it is, with what it means; `--help` shows the default or says that the preset decides."""
     shown = re.sub(r"[\s│]+", " ", run_wide("train", "--help"))
-    settings = {**DGPMPCAgent.own_settings(), **DGPMPCAgent.part_settings("cem")}
+    agent_class, settings_for = options.AGENTS[agent]
+    settings = {**agent_class.own_settings(), **agent_class.part_settings("cem")}
     plain = [name for name, setting in settings.items() if setting.annotation in (int, float, bool, str)]
     assert len(plain) > 20
     for name in set(plain) - options.SET_BY_THE_RUN:
         assert f"--{name.replace('_', '-')}" in shown
-        preset = any(name in each for table in OF_A_TASK for each in table.values())
+        preset = any(name in settings_for(env_id) for table in (*OF_A_TASK, NETWORKS) for env_id in table)
         assert f"{settings[name].default}{' or the preset' if preset else ''}" in shown
     for choices in (KERNELS, DRAWS, REFRESHES, PLANNERS):
         assert "|".join(choices) in shown
@@ -398,11 +400,30 @@ def test_planner_risk_and_exploration_are_options(run):
         assert "|".join(get_args(choices)) in shown
 
 
+def test_a_mixture_of_models(run, drawable):
+    """Its members' settings are options under their names; the presets are theirs too."""
+    command = ("train", ENV_ID, "--agent=mixture", "--episodes=1", "--out=a", "--candidates=6", "--iterations=1")
+    members = ("--members=sparse-gp", "--members=ensemble", "--sparse-gp-num-inducing=4", "--ensemble-num-epochs=2")
+    result = run(*command, *members)
+    assert result.exit_code == 0, result.output
+    checkpoint = read_checkpoint("a/agent.zip").config
+    assert checkpoint["class"] == "MixtureMPCAgent"
+    arguments = checkpoint["arguments"]
+    assert (arguments["members"], arguments["ensemble_num_epochs"]) == (["sparse-gp", "ensemble"], 2)
+    assert run("evaluate", "a", "--episodes", 1).exit_code == 0
+    assert is_one_line_error(run(*command), "members was ['sparse-gp', 'ensemble'], now ['deep-gp', 'ensemble']")
+    assert is_one_line_error(run("train", ENV_ID, "--out=a"), "agent was mixture, now dgp-mpc")
+    assert is_one_line_error(run(*command, "--layers=2"), "mixture", "num_layers", "deep_gp_num_layers")
+    env_id = "VelocityHalfCheetah-v0"
+    preset = mixture_settings_for(env_id)
+    assert _fill_in(env_id, dict.fromkeys(preset), "mixture") == {**preset, "planner": "cem"}
+
+
 def test_a_run_from_before_a_setting_existed_goes_on(run):
     command = ("train", ENV_ID, *SMALLEST, "--no-video", "--out", "a")
     assert run(*command, "--episodes", 1).exit_code == 0
     content = json.loads(Path("a/settings.json").read_text())
-    for name in ("planner", "smoothing", "risk", "exploration_hold"):
+    for name in ("agent", "planner", "smoothing", "risk", "exploration_hold"):
         del content["settings"][name]
     Path("a/settings.json").write_text(json.dumps(content))
     result = run(*command, "--episodes", 2)

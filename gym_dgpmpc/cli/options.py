@@ -7,28 +7,48 @@ Reading the settings imports PyTorch; `cli/__init__.py` does so only when `dgpmp
 
 import inspect
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 import typer
 
-from gym_dgpmpc.agents import DGPMPCAgent, presets
+from gym_dgpmpc.agents import DGPMPCAgent, MixtureMPCAgent, MPCAgent, presets
+from gym_dgpmpc.agents.composition import model_settings
+from gym_dgpmpc.cli.train import DEFAULT_AGENT, RUN
+from gym_dgpmpc.dynamics.mixture.model import MEMBERS
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.planning.registry import PLANNERS, planner_factory
 from gym_dgpmpc.settings import Setting, settings_of
 from gym_dgpmpc.tasks.functions import LEARNED, NEVER
 
+
+class Trained(NamedTuple):
+    """A class of agents that the command line trains, and its presets by the environment's id."""
+
+    agent_class: type[MPCAgent]
+    settings_for: Callable[[str], Mapping[str, Any]]
+
+
+AGENTS: dict[str, Trained] = {
+    "dgp-mpc": Trained(DGPMPCAgent, presets.settings_for),
+    "mixture": Trained(MixtureMPCAgent, presets.mixture_settings_for),
+}
+"""By name. Their settings of the same name, which are one option, mean the same."""
+
 SET_BY_THE_RUN = {"seed", "verbose", "tensorboard_log", "stats_window_size", "observation_spec"}
 """Settings of the agent that are not options: the run has them, or they are not plain values."""
 
+AGENT_TEXT = "What is trained: with a deep Gaussian process, or with a mixture of it and other models."
 PLANNER_TEXT = "Planner, which optimises action sequences."
 SOURCE_TEXTS = {
     "reward_fn": "Let the model learn the reward, even where it is known.",
     "terminated_fn": "Let the model learn when an episode ends, even where it is known; or plan as if none did.",
 }
-CHOICES = {"kernel": tuple(KERNELS)}
+CHOICES = {of_kernel: tuple(KERNELS) for of_kernel in ("kernel", "deep_gp_kernel", "sparse_gp_kernel")}
 """The values of settings whose annotation does not list them."""
+SEVERAL = {"members": tuple(MEMBERS)}
+"""Those of settings that are several of them; such an option is given once for each."""
 
 
 def with_settings(command: Callable[..., None]) -> Callable[..., None]:
@@ -50,10 +70,12 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
 
 def _options() -> Iterable[inspect.Parameter]:
     seen: set[str] = set()
-    own, model = DGPMPCAgent.own_settings(), settings_of(DGPMPCAgent.dynamics_class)
-    groups = [("Model", model), ("Planner", {n: s for n, s in own.items() if n in _PLANNING})]
+    own = MPCAgent.own_settings()
+    groups = [(f"Model of {name}", model_settings(each.agent_class.made_of())) for name, each in AGENTS.items()]
+    groups += [("Planner", {n: s for n, s in own.items() if n in _PLANNING})]
     groups += [("Planner", settings_of(planner_factory(name))) for name in PLANNERS]
     groups += [("Training", {n: s for n, s in own.items() if n not in _PLANNING})]
+    yield _option("agent", _choice("agent", AGENTS), AGENT_TEXT, DEFAULT_AGENT, RUN)
     yield _option(
         "planner", _choice("planner", tuple(PLANNERS)), PLANNER_TEXT, _or_the_presets("planner", ["cem"]), "Planner"
     )
@@ -85,6 +107,8 @@ def _option(name: str, kind: Any, text: str, default: str | bool, panel: str) ->
 
 def _option_type(setting: Setting) -> Any:
     """The type of an option, or None if the setting is not a plain value."""
+    if setting.name in SEVERAL:
+        return list[_choice(setting.name, SEVERAL[setting.name])]  # type: ignore[misc]
     if setting.name in CHOICES:
         return _choice(setting.name, CHOICES[setting.name])
     annotation = setting.annotation
@@ -108,9 +132,12 @@ def _default_text(setting: Setting) -> str | bool:
 
 def _or_the_presets(name: str, texts: list[str]) -> str:
     """A default with a word of presets, if any task has one for this setting."""
-    is_preset = any(name in preset for table in presets.OF_A_TASK for preset in table.values())
+    env_ids = {env_id for table in (*presets.OF_A_TASK, presets.NETWORKS) for env_id in table}
+    is_preset = any(name in each.settings_for(env_id) for each in AGENTS.values() for env_id in env_ids)
     return " or ".join([*texts, *(["the preset's for ENV_ID"] if is_preset else [])])
 
 
 def _plain_value(value: Any) -> Any:
+    if isinstance(value, list):  # empty if the option is not given
+        return tuple(map(_plain_value, value)) or None
     return value.value if isinstance(value, Enum) else value

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from gym_dgpmpc.runs.training import TrainingRun
 
 DEFAULT_EPISODES = 15
+DEFAULT_AGENT = "dgp-mpc"
 RUN = "Run"
 
 
@@ -86,15 +87,16 @@ def train(
 
     Options that you leave out come from the preset for ENV_ID, if there is one, else from the agent's defaults.
     """
+    agent = asked.pop("agent") or DEFAULT_AGENT
     with one_line_errors(ValueError, TypeError):
-        arguments = _fill_in(env_id, {**asked, "seed": seed})
+        arguments = _fill_in(env_id, {**asked, "seed": seed}, agent)
     with one_line_errors(ValueError, AssertionError, OSError):
         if episodes is not None and timesteps is not None:
             raise ValueError("give either --episodes or --timesteps, not both")
         use_threads(threads)
         no_video = prepare_video(env_id) if video else "--no-video was given"
         env = make(env_id, render=not no_video)
-        run = _set_up_run(env, arguments, out, overwrite, episodes, timesteps, checkpoint_every)
+        run = _set_up_run(env, agent, arguments, out, overwrite, episodes, timesteps, checkpoint_every)
     if run.is_complete:
         typer.echo(f"the run in {run.folder.path} has finished: ask for more --episodes, or --overwrite it")
         return
@@ -120,6 +122,7 @@ def train(
 
 def _set_up_run(
     env: gymnasium.Env,
+    agent: str,
     arguments: dict[str, Any],
     out: Path | None,
     overwrite: bool,
@@ -128,7 +131,7 @@ def _set_up_run(
     checkpoint_every: int | None,
 ) -> "TrainingRun":
     """The run that the options describe."""
-    from gym_dgpmpc.agents import DGPMPCAgent
+    from gym_dgpmpc.cli.options import AGENTS
     from gym_dgpmpc.runs.folder import RunFolder
     from gym_dgpmpc.runs.training import TrainingRun, step_limit
 
@@ -141,19 +144,20 @@ def _set_up_run(
         timesteps = step_limit(episodes, max_steps, arguments["learning_starts"])
     folder = RunFolder(
         out or Path("runs") / f"{env_id}-seed{arguments['seed']}",
-        {"environment": env_id, **_identifying(arguments)},
-        defaults=_identifying(_fill_in(env_id, dict.fromkeys(arguments) | {"planner": arguments["planner"]})),
+        {"environment": env_id, "agent": agent, **_identifying(arguments, agent)},
+        defaults={"agent": DEFAULT_AGENT}
+        | _identifying(_fill_in(env_id, dict.fromkeys(arguments) | {"planner": arguments["planner"]}, agent), agent),
         overwrite=overwrite,
     )
     try:
         run = TrainingRun(
             folder,
             env,
-            partial(DGPMPCAgent, **arguments),
+            partial(AGENTS[agent].agent_class, **arguments),
             num_episodes=episodes,
             total_timesteps=timesteps,
             checkpoint_every=checkpoint_every,
-            title=f"{env_id}, L = {arguments['num_layers']}, {arguments['kernel']}, seed {arguments['seed']}",
+            title=f"{env_id}, {_model(arguments)}, seed {arguments['seed']}",
         )
         folder.write_settings(episodes=episodes, timesteps=timesteps)
     except BaseException:
@@ -162,20 +166,27 @@ def _set_up_run(
     return run
 
 
-def _fill_in(env_id: str, asked: dict[str, Any]) -> dict[str, Any]:
+def _model(arguments: dict[str, Any]) -> str:
+    """What a title says of the agent's model."""
+    if "members" in arguments:
+        return " and ".join(arguments["members"])
+    return f"L = {arguments['num_layers']}, {arguments['kernel']}"
+
+
+def _fill_in(env_id: str, asked: dict[str, Any], agent: str = DEFAULT_AGENT) -> dict[str, Any]:
     """Every argument: as given, else from the preset for the environment, else the agent's default.
 
     Raises:
         TypeError: a setting that the agent with this planner does not have was given.
     """
-    from gym_dgpmpc.agents import DGPMPCAgent
-    from gym_dgpmpc.agents.presets import settings_for
+    from gym_dgpmpc.cli.options import AGENTS
 
+    agent_class, settings_for = AGENTS[agent]
     given, preset = {name: value for name, value in asked.items() if value is not None}, settings_for(env_id)
     planner = given.setdefault("planner", preset.get("planner", "cem"))
-    known = {**DGPMPCAgent.own_settings(), **DGPMPCAgent.part_settings(planner)}
+    known = {**agent_class.own_settings(), **agent_class.part_settings(planner)}
     others = {"planner", "reward_fn", "terminated_fn"}
-    refuse_unknown(f"an agent that plans by {planner}", given, {*known, *others})
+    refuse_unknown(f"an agent {agent} that plans by {planner}", given, {*known, *others})
     filled = {name: known[name].default if name in known else None for name in asked if name in {*known, *others}}
     filled |= {name: value for name, value in preset.items() if name in known}
     if "num_candidates" in given and "num_elites" in filled:
@@ -183,11 +194,11 @@ def _fill_in(env_id: str, asked: dict[str, Any]) -> dict[str, Any]:
     return filled | given
 
 
-def _identifying(arguments: dict[str, Any]) -> dict[str, Any]:
+def _identifying(arguments: dict[str, Any], agent: str) -> dict[str, Any]:
     """The arguments that tell one run from another; settings that depend on the machine do not."""
-    from gym_dgpmpc.agents import DGPMPCAgent
+    from gym_dgpmpc.cli.options import AGENTS
 
-    settings = DGPMPCAgent.part_settings(arguments["planner"])
+    settings = AGENTS[agent].agent_class.part_settings(arguments["planner"])
     return {name: value for name, value in arguments.items() if name not in settings or settings[name].is_saved}
 
 
