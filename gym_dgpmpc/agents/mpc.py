@@ -52,7 +52,7 @@ from gym_dgpmpc.checkpoints.safeguard import Guard, safeguard
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
-from gym_dgpmpc.imagination.algorithms import AlgorithmName
+from gym_dgpmpc.imagination.algorithms import AlgorithmName, algorithm_class, budget_of
 from gym_dgpmpc.imagination.beginnings import StartFunction, StartName
 from gym_dgpmpc.imagination.policies import imagine
 from gym_dgpmpc.planning.controller import Controller
@@ -752,38 +752,42 @@ class MPCAgent(BaseAlgorithm):
 
     def imagine_policy(
         self,
-        algorithm: AlgorithmName | type[BaseAlgorithm] = "SAC",
-        total_timesteps: int = 100_000,
+        algorithm: AlgorithmName | type[BaseAlgorithm] = "gradient",
+        total_timesteps: int | None = None,
         *,
         num_worlds: int = 20,
         episode_steps: int | None = None,
         starts: StartName | StartFunction = "mixed",
-        trial_every: int = 5_000,
-        patience: int = 6,
+        trial_every: int | None = None,
+        patience: int = 8,
+        encoded: bool = True,
         seed: int | None = None,
         progress_bar: bool = False,
         **settings: Any,
     ) -> BaseAlgorithm:
         """Train a policy in worlds drawn from the model; it acts by itself, in a fraction of a millisecond.
 
-            policy = agent.imagine_policy("SAC", progress_bar=True)
-            policy.save("policy.zip")  # a file of Stable-Baselines3's: SAC.load needs nothing of this package
+            policy = agent.imagine_policy(progress_bar=True)
+            policy.save("policy.zip")  # a file of Stable-Baselines3's, for TD3.load
 
         The policy is tried every ``trial_every`` imagined steps in worlds that it never learns in. The best one is
         returned, and training ends once ``patience`` trials have brought no better one. The environment is not asked.
         `imagination.policies.imagine` does the same, and returns all trials too.
 
         Args:
-            algorithm: "SAC", "TD3", "DDPG", "PPO" or "A2C"; "TQC" or "CrossQ" where sb3-contrib is installed; or the
-                class of another one of Stable-Baselines3's.
-            total_timesteps: imagined steps to learn from, at most.
+            algorithm: "gradient", which climbs the return through the derivatives of the worlds (a TD3 when it is done,
+                see `PolicyGradient`); or one that needs none: "SAC", "TD3", "DDPG", "PPO" or "A2C"; "TQC" or "CrossQ"
+                where sb3-contrib is installed; or the class of another one of Stable-Baselines3's.
+            total_timesteps: imagined steps to learn from, at most; None: what suits the algorithm.
             num_worlds: worlds side by side.
             episode_steps: steps of an imagined episode; None: the environment's time limit, or 200 if that is less.
             starts: where imagined episodes begin: at "starts", the first observations of recorded episodes; at
                 "states", any recorded observation; "mixed", at either with equal chances; or a function (n, NumPy
                 generator) -> observations [n, S].
-            trial_every: imagined steps between two trials.
+            trial_every: imagined steps between two trials; None: what suits the algorithm.
             patience: trials without a better one after which training ends.
+            encoded: feed the policy angles as sine and cosine, and everything in units of its spread. Its file then
+                names a class of this package, which has to be installed where it is loaded; an exported one does not.
             seed: decides everything random; None: the agent's.
             progress_bar: show one on the terminal.
             **settings: of the algorithm, such as ``policy_kwargs`` and ``learning_rate``.
@@ -796,11 +800,11 @@ class MPCAgent(BaseAlgorithm):
             TrainingError: training diverged.
         """
         with Bars(progress_bar) as bars:
-            bars.begin(total_timesteps)
+            bars.begin(total_timesteps or budget_of(algorithm_class(algorithm)).total_timesteps)
             imagined = imagine(
                 self, algorithm, total_timesteps, num_worlds=num_worlds, episode_steps=episode_steps, starts=starts,
-                trial_every=trial_every, patience=patience, seed=self.seed if seed is None else seed,
-                on_progress=bars.step, **settings,
+                trial_every=trial_every, patience=patience, encoded=encoded,
+                seed=self.seed if seed is None else seed, on_progress=bars.step, **settings,
             )  # fmt: skip
         return imagined.model
 

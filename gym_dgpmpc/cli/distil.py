@@ -30,18 +30,37 @@ def distil(
         ),
     ] = None,
     algorithm: Annotated[
-        str, typer.Option(help="SAC, TD3, DDPG, PPO or A2C of Stable-Baselines3; TQC or CrossQ of sb3-contrib.")
-    ] = "SAC",
-    timesteps: Annotated[int, typer.Option(min=1, help="Imagined steps to learn from, at most.")] = 60_000,
+        str,
+        typer.Option(
+            help="gradient, through the worlds' derivatives; or SAC, TD3, DDPG, PPO or A2C of Stable-Baselines3; TQC "
+            "or CrossQ of sb3-contrib."
+        ),
+    ] = "gradient",
+    timesteps: Annotated[
+        int | None,
+        typer.Option(min=1, help="Imagined steps to learn from, at most.", show_default="what suits the algorithm"),
+    ] = None,
     worlds: Annotated[int, typer.Option(min=1, help="Worlds side by side.")] = 20,
     episode_steps: Annotated[
         int | None,
         typer.Option(min=1, help="Steps of an imagined episode.", show_default="the environment's, at most 200"),
     ] = None,
-    trial_every: Annotated[int, typer.Option(min=1, help="Imagined steps between two trials in held-out worlds.")] = (
-        5_000
-    ),
-    patience: Annotated[int, typer.Option(min=1, help="Trials without a better one, after which it is done.")] = 6,
+    trial_every: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Imagined steps between two trials in held-out worlds.",
+            show_default="what suits the algorithm",
+        ),
+    ] = None,
+    patience: Annotated[int, typer.Option(min=1, help="Trials without a better one, after which it is done.")] = 8,
+    encoded: Annotated[
+        bool,
+        typer.Option(
+            help="Feed the policy angles as sine and cosine, and everything in units of its spread; its file then "
+            "names a class of this package. Without, the file needs nothing but Stable-Baselines3."
+        ),
+    ] = True,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed.", show_default="the agent's")] = None,
     episodes: Annotated[
         int, typer.Option(min=0, help="Episodes to play with it in the real environment when it is done.")
@@ -50,14 +69,15 @@ def distil(
 ) -> None:
     """Train a policy in worlds drawn from the agent's model, for actions in a fraction of a millisecond.
 
-    The file is one of Stable-Baselines3's, and needs nothing of this package. The environment is not asked, but for its
-    rewards, unless --episodes says so.
+    The file is one of Stable-Baselines3's. The environment is not asked, but for its rewards, unless --episodes says
+    so.
     """
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.monitor import Monitor
 
     from gym_dgpmpc.agents import MPCAgent
     from gym_dgpmpc.agents.bars import Bars
+    from gym_dgpmpc.imagination.algorithms import algorithm_class, budget_of
     from gym_dgpmpc.imagination.export import check_suffix, export_policy
     from gym_dgpmpc.imagination.policies import Trial, imagine
 
@@ -74,6 +94,7 @@ def distil(
         env = Monitor(make(environment_of(file, env_id), render=False))
         agent = MPCAgent.load(file, env=env)
         with Bars(True) as bars:
+            timesteps = timesteps or budget_of(algorithm_class(algorithm)).total_timesteps
             bars.begin(timesteps)
             found = imagine(
                 agent,
@@ -83,6 +104,7 @@ def distil(
                 episode_steps=episode_steps,
                 trial_every=trial_every,
                 patience=patience,
+                encoded=encoded,
                 seed=agent.seed if seed is None else seed,
                 on_trial=show,
                 on_progress=bars.step,

@@ -3,23 +3,56 @@
 import importlib
 import inspect
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
+import torch
 from gymnasium import spaces
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-AlgorithmName = Literal["SAC", "TD3", "DDPG", "PPO", "A2C", "TQC", "CrossQ"]
+from gym_dgpmpc.imagination.gradient import PolicyGradient
 
-_OWN: Mapping[str, type[BaseAlgorithm]] = {"SAC": SAC, "TD3": TD3, "DDPG": DDPG, "PPO": PPO, "A2C": A2C}
+AlgorithmName = Literal["gradient", "SAC", "TD3", "DDPG", "PPO", "A2C", "TQC", "CrossQ"]
+
+_OWN: Mapping[str, type[BaseAlgorithm]] = {
+    "gradient": PolicyGradient,
+    "SAC": SAC,
+    "TD3": TD3,
+    "DDPG": DDPG,
+    "PPO": PPO,
+    "A2C": A2C,
+}
 _CONTRIBUTED = ("TQC", "CrossQ")
+
+
+class Budget(NamedTuple):
+    """How long to train, unless it is said.
+
+    Attributes:
+        total_timesteps: imagined steps.
+        trial_every: imagined steps between two trials.
+    """
+
+    total_timesteps: int
+    trial_every: int
+
+
+def budget_of(algorithm: type[BaseAlgorithm]) -> Budget:
+    """The budget that suits an algorithm: a gradient is over thousands of imagined steps, SAC learns from each."""
+    if issubclass(algorithm, PolicyGradient):
+        return Budget(4_000_000, 160_000)
+    if issubclass(algorithm, OnPolicyAlgorithm):
+        return Budget(400_000, 20_000)
+    return Budget(60_000, 3_000)
+
 
 NETWORK: Mapping[str, Any] = {"net_arch": [128, 128]}
 """Smaller than Stable-Baselines3's, since most of the time goes into steps of gradients."""
 
 
 def algorithm_class(algorithm: AlgorithmName | str | type[BaseAlgorithm]) -> type[BaseAlgorithm]:
-    """The class of an algorithm that is given by name, or as a class itself.
+    """The class of an algorithm that is given by name, or as a class itself; "gradient" is `PolicyGradient`.
 
     Raises:
         ValueError: there is none of this name, or it is one of sb3-contrib, which is not installed.
@@ -41,14 +74,29 @@ def algorithm_class(algorithm: AlgorithmName | str | type[BaseAlgorithm]) -> typ
 
 
 def suited_settings(
-    algorithm: type[BaseAlgorithm], num_worlds: int, total_timesteps: int, space: spaces.Space
+    algorithm: type[BaseAlgorithm],
+    num_worlds: int,
+    total_timesteps: int,
+    space: spaces.Space,
+    features: Mapping[str, Any],
 ) -> dict[str, Any]:
     """An algorithm's arguments for so many worlds: off the policy, a gradient step for every imagined step.
 
     On the policy, and where the algorithm has other arguments, its own defaults.
+
+    Args:
+        algorithm: the class.
+        num_worlds: worlds side by side.
+        total_timesteps: imagined steps of the training.
+        space: of observations.
+        features: further arguments of the policy, for vectors of observations.
     """
     policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
-    settings: dict[str, Any] = {"policy": policy, "policy_kwargs": dict(NETWORK)}
+    of_policy = dict(NETWORK) if isinstance(space, spaces.Dict) else {**NETWORK, **features}
+    if issubclass(algorithm, PolicyGradient):
+        of_policy["activation_fn"] = torch.nn.SiLU  # smooth, as a gradient likes it
+        return {"policy": policy, "policy_kwargs": of_policy}
+    settings: dict[str, Any] = {"policy": policy, "policy_kwargs": of_policy}
     if "gradient_steps" in inspect.signature(algorithm).parameters:
         settings |= {
             "train_freq": 1,

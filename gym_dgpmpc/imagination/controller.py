@@ -12,6 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import PlanningError
 from gym_dgpmpc.imagination.algorithms import AlgorithmName, algorithm_class, suited_settings
+from gym_dgpmpc.imagination.features import encoding
 from gym_dgpmpc.imagination.global_randomness import lent_randomness
 from gym_dgpmpc.imagination.policies import imagine, learned_parameters, take_over
 from gym_dgpmpc.imagination.worlds import ImaginedVecEnv, Imagining
@@ -34,11 +35,13 @@ class PolicyController(Controller):
     Args:
         dynamics: see `Controller`, as for all that follow up to ``measure``.
         planner, action_space, num_particles, actions_per_plan, time_budget, measure, device: see `Controller`.
-        algorithm: "SAC", "TD3", "DDPG", "PPO" or "A2C" of Stable-Baselines3; "TQC" or "CrossQ" of sb3-contrib.
+        algorithm: "gradient", which climbs the return through the worlds' derivatives; "SAC", "TD3", "DDPG", "PPO" or
+            "A2C" of Stable-Baselines3; "TQC" or "CrossQ" of sb3-contrib.
         acts_by: "policy", or "planner": then the policy is learned all the same, for when the run is over.
-        imagined_timesteps: imagined steps from which the policy learns after each training of the model, at most.
+        imagined_timesteps: imagined steps from which the policy learns after each training of the model, at most;
+            default: what suits the algorithm.
         num_worlds: worlds side by side in which it learns.
-        trial_every: imagined steps between two trials in worlds that it never learns in.
+        trial_every: imagined steps between two trials in worlds that it never learns in; default: as before.
         trial_patience: trials without a better one after which it stops learning until the next training.
 
     Raises:
@@ -57,23 +60,20 @@ class PolicyController(Controller):
         time_budget: float | None = None,
         measure: RiskMeasure = EXPECTED,
         *,
-        algorithm: AlgorithmName = "SAC",
+        algorithm: AlgorithmName = "gradient",
         acts_by: ActsBy = "policy",
-        imagined_timesteps: int = 20_000,
+        imagined_timesteps: int | None = None,
         num_worlds: int = 20,
-        trial_every: int = 2_000,
-        trial_patience: int = 5,
+        trial_every: int | None = None,
+        trial_patience: int = 8,
         device: torch.device | str = "cpu",
     ):
         super().__init__(
             dynamics, planner, action_space, num_particles, actions_per_plan, time_budget, measure, device=device
         )
-        check_counts(
-            imagined_timesteps=imagined_timesteps,
-            num_worlds=num_worlds,
-            trial_every=trial_every,
-            trial_patience=trial_patience,
-        )
+        optional = {"imagined_timesteps": imagined_timesteps, "trial_every": trial_every}
+        check_counts(**{name: count for name, count in optional.items() if count is not None})
+        check_counts(num_worlds=num_worlds, trial_patience=trial_patience)
         if acts_by not in get_args(ActsBy):
             raise ValueError(f"acts_by must be one of {', '.join(get_args(ActsBy))}, got {acts_by!r}")
         self._kind = algorithm_class(algorithm)
@@ -143,7 +143,8 @@ class PolicyController(Controller):
         if not state:
             return
         space = original_space(agent.env, agent.observation_space)
-        settings = suited_settings(self._kind, self.num_worlds, self.imagined_timesteps, space)
+        features = encoding(agent.store, agent.task.modelled.observation_spec)
+        settings = suited_settings(self._kind, self.num_worlds, 1, space, features)
         # The algorithm reads the spaces off its environment; this one is never stepped.
         never = ImaginedVecEnv(self.dynamics, _unasked, _unasked, space, agent.action_space, num_worlds=1)
         with lent_randomness():

@@ -34,6 +34,8 @@ class PolicyGradient(TD3):
         policy, env, policy_kwargs, seed, device, verbose: as TD3's; ``env`` is an `ImaginedVecEnv` of vectors.
         horizon: steps of a path, H.
         num_paths: paths in each world.
+        action_noise: standard deviation of the noise on a path's actions, in half-widths of their range: a policy that
+            lives with it is not at a loss where the real world leads it somewhere else.
         learning_rate: of Adam at the beginning; it falls to a tenth, linearly.
 
     Raises:
@@ -47,6 +49,7 @@ class PolicyGradient(TD3):
         *,
         horizon: int = 30,
         num_paths: int = 8,
+        action_noise: float = 0.2,
         learning_rate: float = 3e-3,
         policy_kwargs: dict | None = None,
         seed: int | None = None,
@@ -62,9 +65,13 @@ class PolicyGradient(TD3):
             policy, env, learning_rate=learning_rate, buffer_size=1, policy_kwargs=policy_kwargs, seed=seed,
             device=device, verbose=verbose,
         )  # fmt: skip
-        self._paths = Paths(env, horizon, num_paths)
+        self._first_learning_rate = learning_rate
+        self._paths = Paths(env, horizon, num_paths, action_noise)
 
-    def learn(self, total_timesteps: int, callback: BaseCallback | None = None, **_: object) -> "PolicyGradient":  # type: ignore[override]
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_paths", "_first_learning_rate"]
+
+    def learn(self, total_timesteps: int, callback: BaseCallback | None = None, **others: object) -> "PolicyGradient":  # type: ignore[override]
         """Climb until so many imagined steps are taken; the callback is asked after each step of the optimiser.
 
         Raises:
@@ -73,11 +80,12 @@ class PolicyGradient(TD3):
         paths, actor = self._paths, self.actor
         _, callback = self._setup_learn(total_timesteps, callback)
         callback.on_training_start(locals(), globals())
-        optimiser = torch.optim.Adam(actor.parameters(), lr=self.learning_rate)  # type: ignore[arg-type]
+        first = self._first_learning_rate
+        optimiser = torch.optim.Adam(actor.parameters(), lr=first)
         while self.num_timesteps < total_timesteps:
             self.policy.set_training_mode(True)
             for group in optimiser.param_groups:
-                group["lr"] = self.learning_rate * (1.0 - 0.9 * self.num_timesteps / total_timesteps)  # type: ignore
+                group["lr"] = first * (1.0 - 0.9 * self.num_timesteps / total_timesteps)
             mean_reward = paths.mean_reward(actor)
             if not mean_reward.requires_grad:
                 raise NotDifferentiableError(
@@ -104,10 +112,11 @@ class Paths:
         env: whose model, reward, termination, beginnings and plausible range are meant.
         horizon: H.
         num_paths: K, in each of its n worlds.
+        action_noise: standard deviation of the noise on actions, of half their range.
     """
 
-    def __init__(self, env: ImaginedVecEnv, horizon: int, num_paths: int):
-        self._env, self._horizon, self._num_paths = env, horizon, num_paths
+    def __init__(self, env: ImaginedVecEnv, horizon: int, num_paths: int, action_noise: float):
+        self._env, self._horizon, self._num_paths, self._action_noise = env, horizon, num_paths, action_noise
         self.num_steps = horizon * num_paths * env.num_envs
         """Imagined steps of all paths together."""
         self._states: Float[Tensor, "n K S_all"] | None = None
@@ -116,13 +125,16 @@ class Paths:
     def mean_reward(self, actor: torch.nn.Module) -> Float[Tensor, ""]:
         """The mean reward per step of the actor's paths, differentiable by its parameters."""
         env = self._env
-        sampler = env.dynamics.draw(env.num_envs, self._horizon, env.generator)
-        states = self._starts()
+        with torch.no_grad():
+            sampler = env.dynamics.draw(env.num_envs, self._horizon, env.generator)
+        states, dtype = self._starts(), next(actor.parameters()).dtype
         alive = torch.ones_like(states[..., 0], dtype=torch.bool)
         total = torch.zeros_like(states[..., 0])
         for step in range(self._horizon):
-            action = env.unscaled(actor(states[..., : env.observation_size].flatten(0, 1).float())).to(states)
-            action = action.unflatten(0, states.shape[:2])
+            action = actor(states[..., : env.observation_size].flatten(0, 1).to(dtype))
+            noise = torch.randn(action.shape, generator=env.generator, dtype=action.dtype, device=action.device)
+            action = env.unscaled((action + self._action_noise * noise).clamp(-1.0, 1.0))
+            action = action.to(states).unflatten(0, states.shape[:2])
             after = sampler(states, action, step)
             lost = env.left(after) & alive
             # What is lost has no gradient; in its place a state that keeps what comes after it finite.

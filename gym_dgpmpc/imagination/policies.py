@@ -19,8 +19,9 @@ from torch import Tensor
 
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import TrainingError
-from gym_dgpmpc.imagination.algorithms import AlgorithmName, algorithm_class, suited_settings
+from gym_dgpmpc.imagination.algorithms import AlgorithmName, algorithm_class, budget_of, suited_settings
 from gym_dgpmpc.imagination.beginnings import StartFunction, StartName
+from gym_dgpmpc.imagination.features import encoding
 from gym_dgpmpc.imagination.global_randomness import lent_randomness
 from gym_dgpmpc.imagination.worlds import ImaginedVecEnv, Imagining
 from gym_dgpmpc.randomness import derive_seed, fresh_seed
@@ -155,14 +156,15 @@ def take_over(model: BaseAlgorithm, parameters: Mapping[str, Tensor]) -> None:
 
 def imagine(
     agent: Imagining,
-    algorithm: AlgorithmName | str | type[BaseAlgorithm] = "SAC",
-    total_timesteps: int = 100_000,
+    algorithm: AlgorithmName | str | type[BaseAlgorithm] = "gradient",
+    total_timesteps: int | None = None,
     *,
     num_worlds: int = 20,
     episode_steps: int | None = None,
     starts: StartName | StartFunction = "mixed",
-    trial_every: int = 5_000,
-    patience: int = 6,
+    trial_every: int | None = None,
+    patience: int = 8,
+    encoded: bool = True,
     seed: int | None = None,
     begin_with: BaseAlgorithm | None = None,
     on_trial: Callable[[Trial], None] | None = None,
@@ -181,16 +183,25 @@ def imagine(
         TrainingError: training diverged.
     """
     started = time.perf_counter()
-    check_counts(total_timesteps=total_timesteps, trial_every=trial_every, patience=patience)
     kind = algorithm_class(algorithm)
+    total_timesteps = budget_of(kind).total_timesteps if total_timesteps is None else total_timesteps
+    trial_every = budget_of(kind).trial_every if trial_every is None else trial_every
+    check_counts(total_timesteps=total_timesteps, trial_every=trial_every, patience=patience)
     seed = fresh_seed() if seed is None else seed
     seeds = [derive_seed(seed, "imagination", part) for part in (LEARNING, CHOOSING, REPORTING)]
     worlds = ImaginedVecEnv.of(agent, num_worlds, episode_steps=episode_steps, starts=starts, seed=seeds[LEARNING])
     from_starts: StartName | StartFunction = "starts" if isinstance(starts, str) else starts
     held_out = ImaginedVecEnv.of(agent, num_worlds, episode_steps=worlds.episode_steps, starts=from_starts, seed=0)
-    suited = suited_settings(kind, num_worlds, total_timesteps, worlds.observation_space)
+    features = encoding(agent.store, agent.task.modelled.observation_spec) if encoded else {}
+    suited = suited_settings(kind, num_worlds, total_timesteps, worlds.observation_space, features)
+    of_policy = {**suited["policy_kwargs"], **(settings.pop("policy_kwargs", None) or {})}
     with lent_randomness():
-        model = kind(env=worlds, seed=seeds[LEARNING] % 2**31, device=agent.device, **{**suited, **settings})
+        model = kind(
+            env=worlds,
+            seed=seeds[LEARNING] % 2**31,
+            device=agent.device,
+            **{**suited, "policy_kwargs": of_policy, **settings},
+        )
         if begin_with is not None:
             take_over(model, learned_parameters(begin_with))
         chosen = ChooseByWorlds(held_out, seeds[CHOOSING], trial_every, patience, on_trial, on_progress)

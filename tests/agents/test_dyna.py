@@ -14,7 +14,7 @@ from gym_dgpmpc.imagination import controller
 from tests.agents.point_mass import LENGTH, KnownPointMass, actions_of
 from tests.agents.test_dgp_mpc import TINY
 
-QUICK = {"imagined_timesteps": 120, "num_worlds": 4, "trial_every": 60}
+QUICK = {"algorithm": "SAC", "imagined_timesteps": 120, "num_worlds": 4, "trial_every": 60}
 OBSERVATION = np.array([0.7, -0.1])
 
 

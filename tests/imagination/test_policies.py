@@ -14,7 +14,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from gym_dgpmpc.errors import TrainingError
 from gym_dgpmpc.imagination import policies
-from gym_dgpmpc.imagination.algorithms import algorithm_class, suited_settings
+from gym_dgpmpc.imagination.algorithms import algorithm_class, budget_of, suited_settings
+from gym_dgpmpc.imagination.features import EncodedObservation
 from gym_dgpmpc.imagination.global_randomness import lent_randomness
 from gym_dgpmpc.imagination.policies import ChooseByWorlds, Trial, imagine, learned_parameters, take_over
 from gym_dgpmpc.imagination.worlds import ImaginedVecEnv
@@ -37,7 +38,7 @@ def learned():
 
 @pytest.fixture(scope="module")
 def imagined(learned):
-    return imagine(learned, "SAC", 600, patience=50, learning_rate=3e-3, **QUICK)
+    return imagine(learned, "SAC", 600, patience=50, learning_rate=3e-3, encoded=False, **QUICK)
 
 
 def test_it_gets_better_at_the_real_task(learned, imagined):
@@ -59,7 +60,7 @@ def test_the_best_of_the_trials_is_kept(learned, imagined):
 def test_the_seed_decides_everything_and_nothing_else_is_moved(learned, imagined):
     numbers, own = np.random.get_state()[1].tolist(), torch.get_rng_state()  # noqa: NPY002
     planning = learned.generators.planning.get_state()
-    model = learned.imagine_policy("SAC", 600, patience=50, learning_rate=3e-3, **QUICK)
+    model = learned.imagine_policy("SAC", 600, patience=50, learning_rate=3e-3, encoded=False, **QUICK)
     for one, other in zip(model.policy.parameters(), imagined.model.policy.parameters(), strict=True):
         assert torch.equal(one, other)
     assert np.random.get_state()[1].tolist() == numbers and torch.equal(torch.get_rng_state(), own)  # noqa: NPY002
@@ -114,7 +115,7 @@ def test_its_file_needs_nothing_of_this_package(imagined, tmp_path):
 
 
 def test_what_was_learned_is_taken_over(learned, imagined):
-    went_on = imagine(learned, "SAC", 100, begin_with=imagined.model, learning_starts=10**6, **QUICK)
+    went_on = imagine(learned, "SAC", 100, begin_with=imagined.model, learning_starts=10**6, encoded=False, **QUICK)
     for one, other in zip(went_on.model.policy.parameters(), imagined.model.policy.parameters(), strict=True):
         assert torch.equal(one, other)
     parameters = learned_parameters(imagined.model)
@@ -126,14 +127,22 @@ def test_what_was_learned_is_taken_over(learned, imagined):
 def test_algorithms_by_name():
     assert algorithm_class("SAC") is SAC and algorithm_class(DDPG) is DDPG
     assert algorithm_class("CrossQ").__module__.startswith("sb3_contrib")
-    with pytest.raises(ValueError, match=r"SAC, TD3, DDPG, PPO, A2C, TQC, CrossQ, or a class .* got 'DQN'"):
+    with pytest.raises(ValueError, match=r"gradient, SAC, TD3, DDPG, PPO, A2C, TQC, CrossQ, or a class .* got 'DQN'"):
         algorithm_class("DQN")
 
 
 def test_settings_that_suit_worlds():
-    assert suited_settings(SAC, 20, 1_000, spaces.Box(-1, 1, (2,)))["policy"] == "MlpPolicy"
-    of_dicts = suited_settings(SAC, 1, 1_000, spaces.Dict({"a": spaces.Box(-1, 1, (2,))}))
+    box, features = spaces.Box(-1, 1, (2,)), {"features_extractor_class": EncodedObservation}
+    of_vectors = suited_settings(SAC, 20, 1_000, box, features)
+    assert of_vectors["policy"] == "MlpPolicy" and features.items() <= of_vectors["policy_kwargs"].items()
+    of_dicts = suited_settings(SAC, 1, 1_000, spaces.Dict({"a": box}), features)
     assert of_dicts["policy"] == "MultiInputPolicy" and of_dicts["gradient_steps"] == 1
+    assert "features_extractor_class" not in of_dicts["policy_kwargs"]
+
+
+def test_the_budget_is_the_algorithms_own():
+    budgets = {kind: budget_of(algorithm_class(kind)) for kind in ("gradient", "SAC", "PPO")}
+    assert len(set(budgets.values())) == 3 and all(b.total_timesteps > 10 * b.trial_every for b in budgets.values())
 
 
 @pytest.mark.parametrize(
