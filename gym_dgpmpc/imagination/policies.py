@@ -190,7 +190,7 @@ def imagine(
     seed = fresh_seed() if seed is None else seed
     seeds = [derive_seed(seed, "imagination", part) for part in (LEARNING, CHOOSING, REPORTING)]
     worlds = ImaginedVecEnv.of(agent, num_worlds, episode_steps=episode_steps, starts=starts, seed=seeds[LEARNING])
-    from_starts: StartName | StartFunction = "starts" if isinstance(starts, str) else starts
+    from_starts: StartName | StartFunction = "starts"
     held_out = ImaginedVecEnv.of(agent, num_worlds, episode_steps=worlds.episode_steps, starts=from_starts, seed=0)
     features = encoding(agent.store, agent.task.modelled.observation_spec) if encoded else {}
     suited = suited_settings(kind, num_worlds, total_timesteps, worlds.observation_space, features)
