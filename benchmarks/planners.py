@@ -33,8 +33,14 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "iCEM, beta 2": {"planner": "icem", "noise_beta": 2.0},
     "MPPI": {"planner": "mppi"},
     "MPPI, beta 1": {"planner": "mppi", "noise_beta": 1.0},
+    "gradient": {"planner": "gradient"},
+    "gradient, Adam": {"planner": "gradient", "optimiser": "adam"},
+    "gradient from CEM": {"planner": "gradient", "start_from": "cem"},
 }
 """Arguments of `MPCAgent` beside the paper's horizon and actions per plan for the task."""
+
+OF_VALUES = [name for name, arguments in VARIANTS.items() if arguments["planner"] != "gradient"]
+"""Those that plan with the true dynamics too, which have no gradients."""
 
 SETTINGS = argparse.ArgumentParser(add_help=False)
 SETTINGS.add_argument("--steps", type=int, default=200, help="planned steps")
@@ -146,7 +152,13 @@ def main() -> None:
         metavar="ENV_ID",
         help="ids of environments, of recorded ones for a learned model",
     )
-    parser.add_argument("--planners", nargs="+", default=list(VARIANTS), choices=list(VARIANTS), metavar="PLANNER")
+    parser.add_argument(
+        "--planners",
+        nargs="+",
+        choices=list(VARIANTS),
+        metavar="PLANNER",
+        help="default: all that can plan with the dynamics",
+    )
     budgets = [budget(text) for text in ("30x3", "100x3", "100x5", "300x5", "300x10")]
     parser.add_argument(
         "--budgets", nargs="+", type=budget, default=budgets, metavar="KxI", help="candidates and iterations: 300x5"
@@ -155,6 +167,10 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="measurements at a time")
     parser.add_argument("--results", type=Path, default=RESULTS / "planners")
     arguments = parser.parse_args()
+    able = OF_VALUES if arguments.dynamics == "true" else list(VARIANTS)
+    unable = set(arguments.planners or able).difference(able)
+    if unable:
+        parser.error(f"the true dynamics have no gradients: ask for --dynamics learned, or without {sorted(unable)}")
     torch.set_num_threads(1)
     # Seeds outermost, so that an interrupted benchmark has every planner with some seeds.
     wanted: list[Row] = [
@@ -165,7 +181,7 @@ def main() -> None:
         for seed in arguments.seeds
         for env_id in arguments.envs
         for num_candidates, num_iterations in arguments.budgets
-        for planner in arguments.planners
+        for planner in arguments.planners or able
     ]  # fmt: skip
     print(measure_missing("planners", arguments.results, wanted, measure, SETTINGS, page, arguments.jobs))
 

@@ -101,9 +101,9 @@ class MPCAgent(BaseAlgorithm):
         env: the environment, its id, or a VecEnv; actions a bounded Box, observations a vector or a Dict of vectors.
         dynamics: the model to learn; or a function (observation size, action size, `ObservationSpec`) -> model, which
             is needed if the model has to predict reward or termination too, and may be called again when that is found.
-        planner: the optimiser of action sequences: a name ("cem", "icem", "mppi", or what `register_planner` added), a
-            class or function that makes one, or a ready-made planner. Its settings are further arguments of the agent,
-            except of a ready-made one.
+        planner: the optimiser of action sequences: a name ("cem", "icem", "mppi", "gradient", or what
+            `register_planner` added), a class or function that makes one, or a ready-made planner. Its settings are
+            further arguments of the agent, except of a ready-made one.
         reward_fn: r(s, a, s'), batched over leading dimensions, in torch. None: the environment's ``reward_fn`` or
             `compute_reward`, or what is known of Gymnasium's own; if there is none, or with "learned", the model
             predicts it.

@@ -252,6 +252,14 @@ class PathNoise(NamedTuple):
         state = observation - self.errors[step].unsqueeze(1).to(observation.dtype)
         return state if step == 0 else self.observation.fed(state)
 
+    def all_fed(self, states: Float[Tensor, "t P K S"], first: int) -> Float[Tensor, "t P K S"]:
+        """`fed` for the steps ``first``, ``first + 1``, ..."""
+        if self.errors is None or self.observation is None:
+            return states
+        true = states - self.errors[first : first + len(states)].unsqueeze(2).to(states.dtype)
+        later = 1 if first == 0 else 0
+        return torch.cat([true[:later], self.observation.fed(true[later:])])
+
     def observed(self, state: Float[Tensor, "P K S"], step: int) -> Float[Tensor, "P K S"]:
         """What is observed of the state that this step leads to."""
         return state if self.errors is None else state + self.errors[step + 1].unsqueeze(1).to(state.dtype)

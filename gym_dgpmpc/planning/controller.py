@@ -147,6 +147,7 @@ class Controller:
         """One draw of the worlds, made when it is first asked for; plans made together may share it."""
         return cache(lambda: self.dynamics.draw(self.num_particles, self.horizon, generator))
 
+    @torch.inference_mode(False)  # what is made in it has no gradients, which a planner may ask for
     @torch.no_grad()
     def act(
         self,

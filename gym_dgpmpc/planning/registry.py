@@ -10,14 +10,15 @@ import torch
 from gymnasium import spaces
 
 from gym_dgpmpc.planning.cem import CEM
+from gym_dgpmpc.planning.gradient import GradientAscent
 from gym_dgpmpc.planning.icem import ICEM
 from gym_dgpmpc.planning.mppi import MPPI
 from gym_dgpmpc.types import Planner, PlannerFactory
 
-PLANNERS: dict[str, PlannerFactory] = {"cem": CEM, "icem": ICEM, "mppi": MPPI}
+PLANNERS: dict[str, PlannerFactory] = {"cem": CEM, "icem": ICEM, "mppi": MPPI, "gradient": GradientAscent}
 """The registered planners; add to them with `register_planner`."""
 
-PlannerName = Literal["cem", "icem", "mppi"]
+PlannerName = Literal["cem", "icem", "mppi", "gradient"]
 """Those that come with the package, for editors and type checkers; any registered name will do."""
 
 

@@ -200,8 +200,8 @@ def test_any_planner_by_name(agent_class, shooting, tmp_path):
     np.testing.assert_array_equal(*(each.predict(np.ones(2), deterministic=True)[0] for each in (made, loaded)))
     with pytest.raises(TypeError, match="smoothing"):
         agent_class(KnownPointMass(), planner=shooting, smoothing=0.5)
-    with pytest.raises(ValueError, match="gradient"):
-        agent_class(KnownPointMass(), planner="gradient")
+    with pytest.raises(ValueError, match="simplex"):
+        agent_class(KnownPointMass(), planner="simplex")
 
 
 def test_a_file_whose_planner_is_not_registered_says_so(shooting, tmp_path):

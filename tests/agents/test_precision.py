@@ -28,6 +28,9 @@ AGENTS = {
     "PETS": (PETSAgent, PETS),
     "PETS MM": (PETSAgent, {**PETS, "draw": "MM"}),
     "GP": (GPMPCAgent, GP),
+    "gradient": (DGPMPCAgent, {**DEEP_GP, "planner": "gradient"}),
+    "PETS, gradient": (PETSAgent, {**PETS, "draw": "TSinf", "planner": "gradient", "optimiser": "adam"}),
+    "GP, gradient": (GPMPCAgent, {**GP, "draw": "DS", "planner": "gradient", "optimiser": "adam"}),
     "GP AMM": (GPMPCAgent, {**GP, "draw": "AMM", "num_particles": 4}),
 }
 
@@ -158,7 +161,7 @@ def test_the_defaults_of_the_process_change_nothing():
     assert printed[0] == printed[1] == printed[2] and len(printed[0].splitlines()) == len(AGENTS)
 
 
-@pytest.mark.parametrize("name", ["compiled", "pathwise", "PETS", "GP"])
+@pytest.mark.parametrize("name", ["compiled", "pathwise", "PETS", "GP", "gradient", "PETS, gradient", "GP, gradient"])
 def test_torchs_modes_around_an_agent_change_nothing(name, tmp_path):
     agent_class, settings = AGENTS[name]
     plain = agent_class(Place(), **settings).learn(2 * LENGTH)

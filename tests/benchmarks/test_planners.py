@@ -44,6 +44,16 @@ def test_what_is_there_is_not_measured_again(run):
     assert len(run(*sizes, "--seeds", "100", "--dynamics", "learned")) == 8
 
 
+def test_planners_by_gradients_are_left_to_learned_models(run, capsys):
+    sizes = ("--budgets", "10x2", "--envs", "ModCartPole-v0", "--seeds", "100")
+    by_values = {row["planner"] for row in run(*sizes)}
+    more = {row["planner"] for row in run(*sizes, "--dynamics", "learned")} - by_values
+    assert by_values and more == {"gradient", "gradient, Adam", "gradient from CEM"}
+    with pytest.raises(SystemExit):
+        run(*sizes, "--planners", "CEM", "gradient")
+    assert "no gradients: ask for --dynamics learned, or without ['gradient']" in capsys.readouterr().err
+
+
 def test_the_best_earn_more_than_all_that_are_quicker():
     about = {
         "environment": "E",
@@ -70,6 +80,6 @@ def test_every_planner_is_measured(dynamics, monkeypatch):
     task = dict(planners.settings_for("ModCartPole-v0"))
     monkeypatch.setattr(planners, "settings_for", lambda env_id: {**task, **small})
     monkeypatch.setattr(planners, "NUM_RECORDED", 1)
-    for planner in planners.VARIANTS if dynamics == "true" else ("CEM", "iCEM, beta 1", "MPPI"):
+    for planner in planners.OF_VALUES if dynamics == "true" else ("CEM", "iCEM, beta 1", "MPPI", "gradient from CEM"):
         row = planners.measure({**about, "planner": planner, "num_candidates": 6, "num_iterations": 1})
         assert -3 < row["return"] < 3 and row["plan_cpu_ms"] > 0

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gym_dgpmpc.errors import PlanningError
-from gym_dgpmpc.planning import CEM, ICEM, MPPI
+from gym_dgpmpc.planning import CEM, ICEM, MPPI, GradientAscent
 from gym_dgpmpc.planning.plan_state import PlanState, pack, plans_from_tensors, plans_to_tensors, unpack
 from gym_dgpmpc.types import Plan, Planner
 from tests.planning.toy_planners import ElitesKept, RandomShooting
@@ -23,6 +23,9 @@ FACTORIES = {
     "cem": partial(CEM, num_candidates=64, num_elites=8, num_iterations=4),
     "icem": partial(ICEM, num_candidates=64, num_elites=8, num_iterations=4),
     "mppi": partial(MPPI, num_candidates=64, num_iterations=4),
+    "gradient, adam": partial(GradientAscent, num_candidates=16, num_iterations=8, optimiser="adam"),
+    "gradient, lbfgs": partial(GradientAscent, num_candidates=16, num_iterations=2, optimiser="lbfgs"),  # 3 are exact
+    "gradient from cem": partial(GradientAscent, num_iterations=3, start_from="cem", optimiser="adam"),
     "one sequence": partial(RandomShooting, num_candidates=256),
     "elites": partial(ElitesKept, num_candidates=128),
 }

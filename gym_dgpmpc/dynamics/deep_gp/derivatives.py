@@ -95,9 +95,7 @@ class Derivatives:
         Encoding and decoding are a few elementwise maps, of which PyTorch keeps track; they are repeated for each c.
         """
         copies, num_steps = len(gradient), len(states)
-        fed = states
-        if self._noise is not None:
-            fed = torch.stack([self._noise.fed(state, first + step) for step, state in enumerate(states)])
+        fed = states if self._noise is None else self._noise.all_fed(states, first)
         # What follows knows particles and candidates alone: all copies and steps of a particle are particles to it.
         repeated = [each.repeat(copies, 1, 1, 1, 1).flatten(0, 2) for each in (fed, actions)]
         with torch.enable_grad():
@@ -202,10 +200,10 @@ class Trajectories(torch.autograd.Function):
         by_state, by_action = (
             each.permute(1, 2, 3, 0, 4).reshape(horizon, points, size, -1) for each in (by_state, by_action)
         )
-        own = gradient.reshape(horizon + 1, points, 1, size)
-        adjoints = [own[-1]]
-        for step in reversed(range(horizon)):
-            adjoints.append(torch.baddbmm(own[step], adjoints[-1], by_state[step]))
+        *own, last = gradient.reshape(horizon + 1, points, 1, size).unbind()
+        adjoints = [last]
+        for at_state, through in zip(reversed(own), reversed(by_state.unbind()), strict=True):
+            adjoints.append(torch.baddbmm(at_state, adjoints[-1], through))
         start = adjoints.pop()
         by_action = torch.stack(adjoints[::-1]) @ by_action  # [H, points, 1, A]
         by_action = by_action.view(horizon, *states.shape[1:3], -1).sum(1).transpose(0, 1)
