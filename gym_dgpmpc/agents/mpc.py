@@ -52,9 +52,7 @@ from gym_dgpmpc.checkpoints.safeguard import Guard, safeguard
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
-from gym_dgpmpc.imagination.algorithms import AlgorithmName, algorithm_class, budget_of
-from gym_dgpmpc.imagination.beginnings import StartFunction, StartName
-from gym_dgpmpc.imagination.policies import imagine
+from gym_dgpmpc.imagination import AlgorithmName, StartFunction, StartName, algorithm_class, budget_of, imagine
 from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.plan_state import PackedPlans
 from gym_dgpmpc.planning.registry import planner_factory
@@ -752,7 +750,7 @@ class MPCAgent(BaseAlgorithm):
 
     def imagine_policy(
         self,
-        algorithm: AlgorithmName | type[BaseAlgorithm] = "gradient",
+        algorithm: AlgorithmName | type[BaseAlgorithm] = "SAC",
         total_timesteps: int | None = None,
         *,
         num_worlds: int = 20,
@@ -768,16 +766,16 @@ class MPCAgent(BaseAlgorithm):
         """Train a policy in worlds drawn from the model; it acts by itself, in a fraction of a millisecond.
 
             policy = agent.imagine_policy(progress_bar=True)
-            policy.save("policy.zip")  # a file of Stable-Baselines3's, for TD3.load
+            policy.save("policy.zip")  # a file of Stable-Baselines3's, for SAC.load
 
         The policy is tried every ``trial_every`` imagined steps in worlds that it never learns in. The best one is
         returned, and training ends once ``patience`` trials have brought no better one. The environment is not asked.
         `imagination.policies.imagine` does the same, and returns all trials too.
 
         Args:
-            algorithm: "gradient", which climbs the return through the derivatives of the worlds (a TD3 when it is done,
-                see `PolicyGradient`); or one that needs none: "SAC", "TD3", "DDPG", "PPO" or "A2C"; "TQC" or "CrossQ"
-                where sb3-contrib is installed; or the class of another one of Stable-Baselines3's.
+            algorithm: "SAC", "TD3", "DDPG", "PPO" or "A2C"; "TQC" or "CrossQ" where sb3-contrib is installed; the class
+                of another one of Stable-Baselines3's; or "gradient", which climbs the return through the derivatives of
+                the worlds, and is a TD3 when it is done (see `PolicyGradient`).
             total_timesteps: imagined steps to learn from, at most; None: what suits the algorithm.
             num_worlds: worlds side by side.
             episode_steps: steps of an imagined episode; None: the environment's time limit, or 200 if that is less.
@@ -803,8 +801,8 @@ class MPCAgent(BaseAlgorithm):
             bars.begin(total_timesteps or budget_of(algorithm_class(algorithm)).total_timesteps)
             imagined = imagine(
                 self, algorithm, total_timesteps, num_worlds=num_worlds, episode_steps=episode_steps, starts=starts,
-                trial_every=trial_every, patience=patience, encoded=encoded,
-                seed=self.seed if seed is None else seed, on_progress=bars.step, **settings,
+                trial_every=trial_every, patience=patience, encoded=encoded, seed=seed, on_progress=bars.step,
+                **settings,
             )  # fmt: skip
         return imagined.model
 

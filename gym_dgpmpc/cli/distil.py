@@ -32,10 +32,10 @@ def distil(
     algorithm: Annotated[
         str,
         typer.Option(
-            help="gradient, through the worlds' derivatives; or SAC, TD3, DDPG, PPO or A2C of Stable-Baselines3; TQC "
-            "or CrossQ of sb3-contrib."
+            help="SAC, TD3, DDPG, PPO or A2C of Stable-Baselines3; TQC or CrossQ of sb3-contrib; or gradient, through "
+            "the worlds' derivatives."
         ),
-    ] = "gradient",
+    ] = "SAC",
     timesteps: Annotated[
         int | None,
         typer.Option(min=1, help="Imagined steps to learn from, at most.", show_default="what suits the algorithm"),
@@ -105,7 +105,7 @@ def distil(
                 trial_every=trial_every,
                 patience=patience,
                 encoded=encoded,
-                seed=agent.seed if seed is None else seed,
+                seed=seed,
                 on_trial=show,
                 on_progress=bars.step,
             )

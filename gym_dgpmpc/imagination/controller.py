@@ -35,8 +35,8 @@ class PolicyController(Controller):
     Args:
         dynamics: see `Controller`, as for all that follow up to ``measure``.
         planner, action_space, num_particles, actions_per_plan, time_budget, measure, device: see `Controller`.
-        algorithm: "gradient", which climbs the return through the worlds' derivatives; "SAC", "TD3", "DDPG", "PPO" or
-            "A2C" of Stable-Baselines3; "TQC" or "CrossQ" of sb3-contrib.
+        algorithm: "SAC", "TD3", "DDPG", "PPO" or "A2C" of Stable-Baselines3; "TQC" or "CrossQ" of sb3-contrib; or
+            "gradient", which climbs the return through the worlds' derivatives.
         acts_by: "policy", or "planner": then the policy is learned all the same, for when the run is over.
         imagined_timesteps: imagined steps from which the policy learns after each training of the model, at most;
             default: what suits the algorithm.
@@ -60,7 +60,7 @@ class PolicyController(Controller):
         time_budget: float | None = None,
         measure: RiskMeasure = EXPECTED,
         *,
-        algorithm: AlgorithmName = "gradient",
+        algorithm: AlgorithmName = "SAC",
         acts_by: ActsBy = "policy",
         imagined_timesteps: int | None = None,
         num_worlds: int = 20,

@@ -24,7 +24,7 @@ from gym_dgpmpc.imagination.beginnings import StartFunction, StartName
 from gym_dgpmpc.imagination.features import encoding
 from gym_dgpmpc.imagination.global_randomness import lent_randomness
 from gym_dgpmpc.imagination.worlds import ImaginedVecEnv, Imagining
-from gym_dgpmpc.randomness import derive_seed, fresh_seed
+from gym_dgpmpc.randomness import derive_seed
 
 LEARNING, CHOOSING, REPORTING = range(3)
 """The substreams of a seed: worlds to learn in, to choose the policy by, and to say what it earns."""
@@ -156,7 +156,7 @@ def take_over(model: BaseAlgorithm, parameters: Mapping[str, Tensor]) -> None:
 
 def imagine(
     agent: Imagining,
-    algorithm: AlgorithmName | str | type[BaseAlgorithm] = "gradient",
+    algorithm: AlgorithmName | str | type[BaseAlgorithm] = "SAC",
     total_timesteps: int | None = None,
     *,
     num_worlds: int = 20,
@@ -187,7 +187,7 @@ def imagine(
     total_timesteps = budget_of(kind).total_timesteps if total_timesteps is None else total_timesteps
     trial_every = budget_of(kind).trial_every if trial_every is None else trial_every
     check_counts(total_timesteps=total_timesteps, trial_every=trial_every, patience=patience)
-    seed = fresh_seed() if seed is None else seed
+    seed = agent.seed if seed is None else seed
     seeds = [derive_seed(seed, "imagination", part) for part in (LEARNING, CHOOSING, REPORTING)]
     worlds = ImaginedVecEnv.of(agent, num_worlds, episode_steps=episode_steps, starts=starts, seed=seeds[LEARNING])
     from_starts: StartName | StartFunction = "starts"

@@ -14,7 +14,7 @@ from gym_dgpmpc.imagination import controller
 from tests.agents.point_mass import LENGTH, KnownPointMass, actions_of
 from tests.agents.test_dgp_mpc import TINY
 
-QUICK = {"algorithm": "SAC", "imagined_timesteps": 120, "num_worlds": 4, "trial_every": 60}
+QUICK = {"algorithm": "SAC", "imagined_timesteps": 40, "num_worlds": 4, "trial_every": 40}
 OBSERVATION = np.array([0.7, -0.1])
 
 
@@ -59,7 +59,7 @@ def test_it_is_saved_and_goes_on_as_if_it_had_not_been(learned, tmp_path):
     part = tiny().learn(2 * LENGTH)
     part.save(tmp_path / "part")
     loaded = DynaAgent.load(tmp_path / "part", env=point_mass())
-    assert loaded.imagined_timesteps == 120 and loaded.acts_by == "policy"
+    assert loaded.imagined_timesteps == 40 and loaded.acts_by == "policy"
     np.testing.assert_array_equal(loaded.predict(OBSERVATION)[0], part.predict(OBSERVATION)[0])
     loaded.learn(LENGTH, reset_num_timesteps=False)
     third = actions_of(learned.env.envs[0])[2 * LENGTH : 3 * LENGTH]
@@ -97,7 +97,7 @@ def test_what_it_imagined_is_logged(learned):
     agent = tiny()
     agent.set_logger(Keeping(None, []))
     agent.learn(LENGTH)
-    assert logged["train/imagined_steps"] == 120 and np.isfinite(logged["train/imagined_return"])
+    assert logged["train/imagined_steps"] == 40 and np.isfinite(logged["train/imagined_return"])
 
 
 def test_a_policy_that_is_not_finite_does_not_act():
