@@ -246,5 +246,25 @@ class Planner(Protocol[AnyPlan]):
         ...
 
 
+@runtime_checkable
+class ProposalPlanner(Planner[AnyPlan], Protocol[AnyPlan]):
+    """A planner that takes sequences from elsewhere, such as a policy's, among its own."""
+
+    def plan(
+        self,
+        objective: Objective,
+        plan: AnyPlan,
+        generator: torch.Generator,
+        deadline: float | None = None,
+        proposals: Float[Tensor, "n H A"] | None = None,
+    ) -> tuple[AnyPlan, PlanInfo]:
+        """As `Planner.plan`.
+
+        Args:
+            proposals: sequences within the bounds, to try in the place of some of the planner's own.
+        """
+        ...
+
+
 PlannerFactory = Callable[..., Planner]
 """(action_low, action_high, *, horizon=..., settings) -> a planner; see `Planner`."""

@@ -1,5 +1,6 @@
 """A controller that learns a policy in the model's worlds after every training, and acts by it."""
 
+import inspect
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal, get_args
@@ -7,7 +8,9 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 import torch
 from gymnasium import spaces
+from jaxtyping import Float
 from stable_baselines3.common.base_class import BaseAlgorithm
+from torch import Tensor
 
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import PlanningError
@@ -15,11 +18,12 @@ from gym_dgpmpc.imagination.algorithms import AlgorithmName, algorithm_class, su
 from gym_dgpmpc.imagination.features import encoding
 from gym_dgpmpc.imagination.global_randomness import lent_randomness
 from gym_dgpmpc.imagination.policies import imagine, learned_parameters, take_over
+from gym_dgpmpc.imagination.values import learns_values, state_value
 from gym_dgpmpc.imagination.worlds import ImaginedVecEnv, Imagining
 from gym_dgpmpc.planning.controller import Acted, Controller
 from gym_dgpmpc.planning.plan_state import PlanState
 from gym_dgpmpc.planning.risk import RiskMeasure
-from gym_dgpmpc.planning.rollout import EXPECTED
+from gym_dgpmpc.planning.rollout import EXPECTED, Tail
 from gym_dgpmpc.randomness import derive_seed
 from gym_dgpmpc.tasks.dict_observations import original_space, unflattened
 from gym_dgpmpc.tasks.task import Task
@@ -43,6 +47,11 @@ class PolicyController(Controller):
         num_worlds: worlds side by side in which it learns.
         trial_every: imagined steps between two trials in worlds that it never learns in; default: as before.
         trial_patience: trials without a better one after which it stops learning until the next training.
+        proposes: with ``acts_by="planner"``, whether the policy's action sequences, one in each particle's world, are
+            among the planner's candidates.
+        terminal_value: with ``acts_by="planner"``, whether what the policy's critics expect after a plan's last step is
+            part of a plan's return, which is discounted then; so that plans see past their horizon.
+        value_depths: of how many of a plan's last steps the mean of such returns is taken.
 
     Raises:
         TypeError, ValueError: as `Controller`; or a setting is out of its range.
@@ -66,6 +75,9 @@ class PolicyController(Controller):
         num_worlds: int = 20,
         trial_every: int | None = None,
         trial_patience: int = 8,
+        proposes: bool = False,
+        terminal_value: bool = False,
+        value_depths: int = 1,
         device: torch.device | str = "cpu",
     ):
         super().__init__(
@@ -73,10 +85,15 @@ class PolicyController(Controller):
         )
         optional = {"imagined_timesteps": imagined_timesteps, "trial_every": trial_every}
         check_counts(**{name: count for name, count in optional.items() if count is not None})
-        check_counts(num_worlds=num_worlds, trial_patience=trial_patience)
+        check_counts(num_worlds=num_worlds, trial_patience=trial_patience, value_depths=value_depths)
         if acts_by not in get_args(ActsBy):
             raise ValueError(f"acts_by must be one of {', '.join(get_args(ActsBy))}, got {acts_by!r}")
         self._kind = algorithm_class(algorithm)
+        if terminal_value and not learns_values(self._kind):
+            raise ValueError(f"{algorithm!r} learns no values for terminal_value: take SAC, TD3, TQC or CrossQ")
+        if proposes and "proposals" not in inspect.signature(planner.plan).parameters:
+            raise ValueError(f"{type(planner).__name__} takes no proposals (see types.ProposalPlanner)")
+        self.proposes, self.terminal_value, self.value_depths = proposes, terminal_value, value_depths
         self.acts_by, self.imagined_timesteps, self.num_worlds = acts_by, imagined_timesteps, num_worlds
         self.trial_every, self.trial_patience = trial_every, trial_patience
         self.policy: BaseAlgorithm | None = None
@@ -128,6 +145,30 @@ class PolicyController(Controller):
             raise PlanningError(f"the policy returned the action {action} at the observation {observation}")
         action = torch.from_numpy(action).to(self._low).clamp(self._low, self._high).cpu().numpy()
         return Acted(action, self.cold, _NOTHING_PLANNED, time.perf_counter() - started, False)
+
+    def tail(self, task: Task) -> Tail | None:
+        """The value that the policy's critics give to the states after a plan."""
+        if self.policy is None or not self.terminal_value:
+            return None
+        value, size = state_value(self.policy), task.modelled.observation_size
+        return Tail(lambda states: value(states[..., :size]), self.policy.gamma, self.value_depths)  # type: ignore[attr-defined]
+
+    def proposals(
+        self, task: Task, sampler: TransitionSampler, start: Float[Tensor, " S_all"]
+    ) -> Float[Tensor, "P H A"] | None:
+        """What the policy would do from here in each particle's world, step after step."""
+        if self.policy is None or not self.proposes:
+            return None
+        states, actions = start.expand(self.num_particles, 1, -1), []
+        size, space = task.modelled.observation_size, self.policy.observation_space
+        for step in range(self.horizon):
+            shown = unflattened(states[:, 0, :size].cpu().numpy(), space)
+            taken = np.asarray(self.policy.predict(shown, deterministic=True)[0], dtype=np.float32)
+            action = torch.from_numpy(taken.reshape(self.num_particles, 1, -1)).to(start)
+            states = sampler(states, action, step)
+            actions.append(action.squeeze(1))
+        found = torch.stack(actions, dim=1)
+        return found[found.isfinite().all(-1).all(-1)]
 
     def state_dict(self) -> StateDict:
         """What the policy has learned; nothing before the first training."""

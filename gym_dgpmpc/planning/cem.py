@@ -22,6 +22,7 @@ from gym_dgpmpc.planning.search import (
     no_finite_score,
     scored,
     shifted,
+    with_proposals,
 )
 from gym_dgpmpc.types import Objective, PlanInfo
 
@@ -170,7 +171,12 @@ class CEM:
 
     @torch.no_grad()
     def plan(
-        self, objective: Objective, plan: GaussianPlan, generator: torch.Generator, deadline: float | None = None
+        self,
+        objective: Objective,
+        plan: GaussianPlan,
+        generator: torch.Generator,
+        deadline: float | None = None,
+        proposals: Float[Tensor, "n H A"] | None = None,
     ) -> tuple[GaussianPlan, PlanInfo]:
         """Maximise ``objective`` from ``plan``.
 
@@ -180,6 +186,7 @@ class CEM:
         Args:
             deadline: a time of `time.perf_counter`; see `iterations`. With no time for a single iteration the result
                 is ``plan`` within the bounds.
+            proposals: sequences to try too, within the bounds, in the place of some of the planner's own.
 
         Raises:
             PlanningError: no candidate of an iteration had a finite score.
@@ -197,7 +204,7 @@ class CEM:
             room = torch.minimum(mean - low, high - mean)
             std = torch.minimum(variance.sqrt(), room / TRUNCATION)
             noise = truncated_normal(shape, generator, device=low.device, dtype=low.dtype)
-            candidates = (mean + std * noise).clamp_(low, high)
+            candidates = with_proposals((mean + std * noise).clamp_(low, high), proposals)
 
             # Score them, select the elites and refit.
             scores = scored(objective, candidates)

@@ -23,7 +23,7 @@ from gym_dgpmpc.forks import compute_on_one_thread_in_children
 from gym_dgpmpc.planning.plan_state import PlanState
 from gym_dgpmpc.planning.registry import action_bounds
 from gym_dgpmpc.planning.risk import RiskMeasure
-from gym_dgpmpc.planning.rollout import EXPECTED, rollout_objective
+from gym_dgpmpc.planning.rollout import EXPECTED, Tail, rollout_objective
 from gym_dgpmpc.tasks.task import Task
 from gym_dgpmpc.types import DynamicsModel, Plan, PlanInfo, Planner, TransitionSampler
 
@@ -185,10 +185,12 @@ class Controller:
             reward_fn, terminated_fn = task.planned[:2]
             assert reward_fn is not None
             objective = rollout_objective(
-                drawn, reward_fn, start, self.num_particles, terminated_fn, measure=self.measure
+                drawn, reward_fn, start, self.num_particles, terminated_fn, measure=self.measure, tail=self.tail(task)
             )
+            proposals = self.proposals(task, drawn, start)
+            offered = {} if proposals is None else {"proposals": proposals.to(self._low).clamp(self._low, self._high)}
             try:
-                plan, info = self.planner.plan(objective, plan, generator, deadline=deadline)
+                plan, info = self.planner.plan(objective, plan, generator, deadline=deadline, **offered)
                 late = deadline is not None and time.perf_counter() > deadline
                 self._check_planned(plan)
             except PlanningError as error:
@@ -199,6 +201,16 @@ class Controller:
         age += 1
         after = PlanState(plan, age) if age < self.actions_per_plan else PlanState(self.planner.shift(plan, age))
         return Acted(action, after, info, time.perf_counter() - started, late)
+
+    def tail(self, task: Task) -> Tail | None:
+        """What follows a plan's last step; nothing, unless a subclass knows better."""
+        return None
+
+    def proposals(
+        self, task: Task, sampler: TransitionSampler, start: Float[torch.Tensor, " S_all"]
+    ) -> Float[torch.Tensor, "n H A"] | None:
+        """Sequences for the planner to try among its own; none, unless a subclass has some."""
+        return None
 
     def midpoint(self) -> np.ndarray:
         """The middle of the action range, [A]."""

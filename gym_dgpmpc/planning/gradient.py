@@ -29,6 +29,7 @@ from gym_dgpmpc.planning.search import (
     no_finite_score,
     scored,
     shifted,
+    with_proposals,
 )
 from gym_dgpmpc.types import Objective, PlanInfo
 
@@ -132,13 +133,19 @@ class GradientAscent:
 
     @torch.no_grad()
     def plan(
-        self, objective: Objective, plan: Sequence, generator: torch.Generator, deadline: float | None = None
+        self,
+        objective: Objective,
+        plan: Sequence,
+        generator: torch.Generator,
+        deadline: float | None = None,
+        proposals: Float[Tensor, "n H A"] | None = None,
     ) -> tuple[Sequence, PlanInfo]:
         """Maximise ``objective`` from ``plan``; a sequence whose score or gradient is not finite goes back.
 
         Args:
             deadline: a time of `time.perf_counter`; see `iterations`. With no time for a single iteration the result
                 is ``plan`` within the bounds, or what CEM made of it.
+            proposals: sequences to try too, within the bounds, in the place of some of the planner's own.
 
         Raises:
             PlanningError: no sequence has had a finite score.
@@ -161,7 +168,9 @@ class GradientAscent:
             (num_rows, self.horizon, len(low)), self.noise_beta, generator, device=low.device, dtype=low.dtype
         )
         noise[0] = 0.0
-        start = ((best + std * noise).clamp(low, high) - low) / torch.where(width > 0, width, 1.0)
+        around = (best + std * noise).clamp(low, high)
+        around = torch.cat([around[:1], with_proposals(around[1:], proposals)])
+        start = (around - low) / torch.where(width > 0, width, 1.0)
         ascent = ASCENTS[self.optimiser].init(start.flatten(1), self.action_step, self.num_iterations)
         first_score = math.nan
         for iteration in iterations(self.num_iterations, deadline):

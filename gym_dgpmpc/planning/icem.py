@@ -25,6 +25,7 @@ from gym_dgpmpc.planning.search import (
     no_finite_score,
     scored,
     shifted,
+    with_proposals,
 )
 from gym_dgpmpc.types import Objective, PlanInfo
 
@@ -138,7 +139,12 @@ class ICEM:
 
     @torch.no_grad()
     def plan(
-        self, objective: Objective, plan: PlanWithElites, generator: torch.Generator, deadline: float | None = None
+        self,
+        objective: Objective,
+        plan: PlanWithElites,
+        generator: torch.Generator,
+        deadline: float | None = None,
+        proposals: Float[Tensor, "n H A"] | None = None,
     ) -> tuple[PlanWithElites, PlanInfo]:
         """Maximise ``objective`` from ``plan``.
 
@@ -148,6 +154,7 @@ class ICEM:
         Args:
             deadline: a time of `time.perf_counter`; see `iterations`. With no time for a single iteration the result
                 is ``plan`` within the bounds.
+            proposals: sequences to try too, within the bounds, in the place of some of the planner's own.
 
         Raises:
             PlanningError: no candidate of an iteration had a finite score.
@@ -165,6 +172,7 @@ class ICEM:
             if iteration == self.num_iterations:
                 candidates[0] = mean.clamp(low, high)
             if iteration == 1:
+                candidates = with_proposals(candidates, proposals)
                 candidates = torch.cat([candidates, self._completed(plan, mean, variance, generator)])
 
             # Score them; the elites of the iteration before have been scored.

@@ -24,6 +24,7 @@ from gym_dgpmpc.planning.search import (
     no_finite_score,
     scored,
     shifted,
+    with_proposals,
 )
 from gym_dgpmpc.types import Objective, PlanInfo
 
@@ -137,13 +138,19 @@ class MPPI:
 
     @torch.no_grad()
     def plan(
-        self, objective: Objective, plan: Sequence, generator: torch.Generator, deadline: float | None = None
+        self,
+        objective: Objective,
+        plan: Sequence,
+        generator: torch.Generator,
+        deadline: float | None = None,
+        proposals: Float[Tensor, "n H A"] | None = None,
     ) -> tuple[Sequence, PlanInfo]:
         """Maximise ``objective`` from ``plan``; a score that is not finite has no weight.
 
         Args:
             deadline: a time of `time.perf_counter`; see `iterations`. With no time for a single iteration the result
                 is ``plan`` within the bounds.
+            proposals: sequences to try too, within the bounds, in the place of some of the planner's own.
 
         Raises:
             PlanningError: no candidate of an iteration had a finite score.
@@ -158,7 +165,7 @@ class MPPI:
         for iteration in iterations(self.num_iterations, deadline):
             # Sample around the mean, within the bounds, and score.
             noise = coloured_noise(shape, self.noise_beta, generator, device=low.device, dtype=low.dtype)
-            candidates = (mean + std * noise).clamp(low, high)
+            candidates = with_proposals((mean + std * noise).clamp(low, high), proposals)
             scores = scored(objective, candidates)
             finite = scores.isfinite()
 

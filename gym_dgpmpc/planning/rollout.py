@@ -8,7 +8,8 @@ where a particle is alive until, and including, the step in which it terminates.
 their mean, the Monte Carlo estimate of the expected return, or another one of `risk.py`.
 """
 
-from typing import Literal
+from collections.abc import Callable
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,6 +21,20 @@ from gym_dgpmpc.planning.risk import RiskMeasure
 from gym_dgpmpc.types import Objective, RewardFn, TerminatedFn, TrajectorySampler, TransitionSampler
 
 EXPECTED = RiskMeasure()
+
+
+class Tail(NamedTuple):
+    """What follows a plan's last step: the return is sum_{t<h} g^t r_t + g^h V(s_h), averaged over the last depths h.
+
+    Attributes:
+        value: V, of states, batched over any leading dimensions.
+        discount: g, with which V was learned, in (0, 1].
+        depths: of how many depths h = H, H - 1, ... the mean is taken; values are rough, and their errors differ.
+    """
+
+    value: Callable[[Float[Tensor, "*b S"]], Float[Tensor, "*b"]]
+    discount: float
+    depths: int = 1
 
 
 @grad_if_asked
@@ -68,12 +83,15 @@ def particle_returns(
     actions: Float[Tensor, "K H A"],
     reward_fn: RewardFn,
     terminated_fn: TerminatedFn | None = None,
+    tail: Tail | None = None,
 ) -> Float[Tensor, "P K"]:
     """The return of every particle of every candidate, with the reward evaluated in one call over [H, P, K].
 
     The step that terminates earns its reward; whatever the model predicts after it counts for nothing. A particle
     whose state is not finite while it is alive has the return NaN, even where the reward function would hide that
     (a comparison with NaN is simply false), so that a diverged particle cannot pass for a good one.
+
+    With a ``tail`` rewards are discounted, and what follows counts, for particles that are alive at its depths.
 
     Differentiable where the states require gradients; that the reward is, is up to its function. When a particle
     terminates has no gradient.
@@ -92,11 +110,32 @@ def particle_returns(
     if states.device.type != "cpu" or not bool(next_observation.sum().isfinite()):
         # Zero where the whole state is finite and NaN elsewhere, in two passes over the states.
         reward = reward + (next_observation * 0.0).sum(dim=-1)
+    terminated = None
     if terminated_fn is not None:
         terminated = terminated_fn(next_observation)
         _check_output("terminated_fn", terminated, batch, "boolean")
         reward = reward.masked_fill(~_alive(terminated), 0.0)
-    return reward.sum(dim=0)
+    return reward.sum(dim=0) if tail is None else _with_tail(reward, next_observation, terminated, tail)
+
+
+def _with_tail(
+    reward: Float[Tensor, "H P K"],
+    next_observation: Float[Tensor, "H P K S"],
+    terminated: Bool[Tensor, "H P K"] | None,
+    tail: Tail,
+) -> Float[Tensor, "P K"]:
+    """The discounted rewards and the value of what follows them, the mean over the last depths."""
+    horizon = len(reward)
+    steps = torch.arange(horizon + 1, dtype=reward.dtype, device=reward.device)
+    discount = (tail.discount**steps).view(-1, 1, 1)
+    so_far = (discount[:-1] * reward).cumsum(dim=0)
+    depths = min(tail.depths, horizon)
+    value = tail.value(next_observation[-depths:]).to(reward)
+    _check_output("value", value, next_observation[-depths:].shape[:-1], "floating-point")
+    if terminated is not None:
+        over = terminated.to(torch.uint8).cummax(dim=0).values[-depths:].bool()
+        value = value.masked_fill(over, 0.0)
+    return (so_far[-depths:] + discount[-depths:] * value).mean(dim=0)
 
 
 def rollout_objective(
@@ -106,6 +145,7 @@ def rollout_objective(
     num_particles: int,
     terminated_fn: TerminatedFn | None = None,
     measure: RiskMeasure = EXPECTED,
+    tail: Tail | None = None,
 ) -> Objective:
     """The planner's objective: what ``measure`` makes of the particles' returns from ``observation``.
 
@@ -125,7 +165,7 @@ def rollout_objective(
 
     def score(actions: Float[Tensor, "K H A"]) -> Float[Tensor, " K"]:
         states = rollout(sampler, observation, actions, num_particles)
-        return measure(particle_returns(states, actions, reward_fn, terminated_fn))
+        return measure(particle_returns(states, actions, reward_fn, terminated_fn, tail))
 
     return score
 

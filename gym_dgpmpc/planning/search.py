@@ -88,6 +88,14 @@ def iterations(count: int, deadline: float | None) -> Iterator[int]:
         slowest = max(slowest, now - before)
 
 
+def with_proposals(candidates: Float[Tensor, "K H A"], proposals: Float[Tensor, "n H A"] | None) -> Tensor:
+    """The candidates with others' sequences in the place of the first n, of K at most."""
+    if proposals is None or len(proposals) == 0:
+        return candidates
+    count = min(len(proposals), len(candidates))
+    return torch.cat([proposals[:count].to(candidates), candidates[count:]])
+
+
 def scored(objective: Objective, candidates: Float[Tensor, "K H A"]) -> Float[Tensor, " K"]:
     """The objective's scores.
 
