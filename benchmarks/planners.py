@@ -99,7 +99,9 @@ def _with_a_learned_model(wanted: Row) -> MPCAgent:
 
 
 def _planner(wanted: Row) -> dict[str, Any]:
-    return {**VARIANTS[wanted["planner"]], **{name: wanted[name] for name in ("num_candidates", "num_iterations")}}
+    arguments = VARIANTS[wanted["planner"]]
+    candidates = "num_starts" if arguments["planner"] == "gradient" else "num_candidates"
+    return {**arguments, candidates: wanted["num_candidates"], "num_iterations": wanted["num_iterations"]}
 
 
 class _Stopwatch:

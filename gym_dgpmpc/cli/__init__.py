@@ -27,10 +27,10 @@ class _Commands(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] == "train":
-            from gym_dgpmpc.cli.options import with_settings
+            from gym_dgpmpc.cli.options import agent_asked_for, with_settings
 
             complete = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-            complete.command("train")(with_settings(train.train))
+            complete.command("train")(with_settings(train.train, agent_asked_for(args)))
             self.commands["train"] = get_command(complete)
         return super().resolve_command(ctx, args)
 

@@ -7,13 +7,14 @@ Reading the settings imports PyTorch; `cli/__init__.py` does so only when `dgpmp
 
 import inspect
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import Enum
+from itertools import pairwise
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 import typer
 
-from gym_dgpmpc.agents import DGPMPCAgent, MixtureMPCAgent, MPCAgent, presets
+from gym_dgpmpc.agents import DGPMPCAgent, DynaAgent, MixtureMPCAgent, MPCAgent, presets
 from gym_dgpmpc.agents.composition import model_settings
 from gym_dgpmpc.cli.train import DEFAULT_AGENT, RUN
 from gym_dgpmpc.dynamics.mixture.model import MEMBERS
@@ -32,6 +33,7 @@ class Trained(NamedTuple):
 
 AGENTS: dict[str, Trained] = {
     "dgp-mpc": Trained(DGPMPCAgent, presets.settings_for),
+    "dyna": Trained(DynaAgent, presets.settings_for),
     "mixture": Trained(MixtureMPCAgent, presets.mixture_settings_for),
 }
 """By name. Their settings of the same name, which are one option, mean the same."""
@@ -39,7 +41,10 @@ AGENTS: dict[str, Trained] = {
 SET_BY_THE_RUN = {"seed", "verbose", "tensorboard_log", "stats_window_size", "observation_spec"}
 """Settings of the agent that are not options: the run has them, or they are not plain values."""
 
-AGENT_TEXT = "What is trained: with a deep Gaussian process, or with a mixture of it and other models."
+AGENT_TEXT = (
+    "What is trained: a planner with a deep Gaussian process; one that acts by a policy from its worlds; or a planner "
+    "with a mixture of models. `--agent NAME --help` shows the options of each."
+)
 PLANNER_TEXT = "Planner, which optimises action sequences."
 SOURCE_TEXTS = {
     "reward_fn": "Let the model learn the reward, even where it is known.",
@@ -51,15 +56,28 @@ SEVERAL = {"members": tuple(MEMBERS)}
 """Those of settings that are several of them; such an option is given once for each."""
 
 
-def with_settings(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with an option for each setting; their values are passed to it by name, as ``asked``."""
+def agent_asked_for(args: Sequence[str]) -> str:
+    """The agent that a command line names, or the default; what is wrong about it is said when it is parsed."""
+    given = [value for value in args if value.startswith("--agent=")]
+    following = [after for option, after in pairwise(args) if option == "--agent"]
+    name = (given[-1].partition("=")[2] if given else None) or (following[-1] if following else DEFAULT_AGENT)
+    return name if name in AGENTS else DEFAULT_AGENT
+
+
+def with_settings(command: Callable[..., None], agent: str = DEFAULT_AGENT) -> Callable[..., None]:
+    """The command with an option for each setting; their values are passed to it by name, as ``asked``.
+
+    Args:
+        command: the command.
+        agent: the one whose options its help shows.
+    """
 
     def with_options(**given: Any) -> None:
         asked = {name: _plain_value(given.pop(name)) for name in names}
         command(**given, asked=asked)
 
     own = [p for p in inspect.signature(command).parameters.values() if p.name != "asked"]
-    options = list(_options())
+    options = list(_options(agent))
     names = [option.name for option in options]
     with_options.__doc__ = command.__doc__
     with_options.__name__ = command.__name__
@@ -68,10 +86,13 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
     return with_options
 
 
-def _options() -> Iterable[inspect.Parameter]:
+def _options(agent: str) -> Iterable[inspect.Parameter]:
     seen: set[str] = set()
+    made_of = AGENTS[agent].agent_class.made_of()
+    shown = {*model_settings(made_of), *settings_of(made_of.controller_class)}
     own = MPCAgent.own_settings()
     groups = [(f"Model of {name}", model_settings(each.agent_class.made_of())) for name, each in AGENTS.items()]
+    groups += [(f"Policy of {name}", settings_of(each.agent_class.controller_class)) for name, each in AGENTS.items()]
     groups += [("Planner", {n: s for n, s in own.items() if n in _PLANNING})]
     groups += [("Planner", settings_of(planner_factory(name))) for name in PLANNERS]
     groups += [("Training", {n: s for n, s in own.items() if n not in _PLANNING})]
@@ -84,7 +105,8 @@ def _options() -> Iterable[inspect.Parameter]:
             kind = _option_type(setting)
             if setting.name not in seen | SET_BY_THE_RUN and kind is not None:
                 seen.add(setting.name)
-                yield _option(setting.name, kind, setting.text, _default_text(setting), panel)
+                hidden = setting.name not in shown and panel.startswith(("Model", "Policy"))
+                yield _option(setting.name, kind, setting.text, _default_text(setting), panel, hidden=hidden)
     for name, text in SOURCE_TEXTS.items():
         choices = (LEARNED, NEVER) if name == "terminated_fn" else (LEARNED,)
         yield _option(name, _choice(name, choices), text, "what is known; else learned", "Task")
@@ -93,13 +115,15 @@ def _options() -> Iterable[inspect.Parameter]:
 _PLANNING = ("num_particles", "actions_per_plan", "risk", "risk_aversion", "cvar_share", "time_budget")
 
 
-def _option(name: str, kind: Any, text: str, default: str | bool, panel: str) -> inspect.Parameter:
+def _option(
+    name: str, kind: Any, text: str, default: str | bool, panel: str, *, hidden: bool = False
+) -> inspect.Parameter:
     dashed = name.replace("_", "-")
     names = [f"--{dashed}", *([f"--{dashed.removeprefix('num-')}"] if dashed.startswith("num-") else [])]
     if kind is bool:
         names = [f"--{dashed}/--no-{dashed}"]
     text = f"{text[:1].upper()}{text[1:]}".replace("``", "")
-    option = typer.Option(*names, help=text, show_default=default, rich_help_panel=panel)
+    option = typer.Option(*names, help=text, show_default=default, rich_help_panel=panel, hidden=hidden)
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind | None, option]
     )

@@ -56,7 +56,7 @@ class GradientAscent:
         action_low: lower bounds of the action, [A], finite; their dtype and device are those of the plans.
         action_high: upper bounds, with the same dtype and device.
         horizon: actions in a plan, H; the time a plan takes grows with it.
-        num_candidates: sequences that climb side by side, K.
+        num_starts: sequences that climb side by side, K.
         num_iterations: steps of a plan, at most, each with one gradient of all sequences.
         optimiser: "lbfgs", which finds the very top where the return is smooth; or "adam".
         action_step: how far the first step moves an action at most, as a fraction of its range. The steps of "adam"
@@ -74,7 +74,7 @@ class GradientAscent:
     """
 
     largest: ClassVar[Mapping[str, int]] = MappingProxyType(
-        {"horizon": 10**4, "num_candidates": 10**4, "cem_candidates": 10**5}
+        {"horizon": 10**4, "num_starts": 10**4, "cem_candidates": 10**5}
     )
     """What a file may claim; see `settings.settings_of`."""
 
@@ -84,7 +84,7 @@ class GradientAscent:
         action_high: Float[Tensor, " A"],
         *,
         horizon: int = 30,
-        num_candidates: int = 4,
+        num_starts: int = 4,
         num_iterations: int = 10,
         optimiser: Optimiser = "lbfgs",
         action_step: float = 0.1,
@@ -95,7 +95,7 @@ class GradientAscent:
         noise_beta: float = 1.0,
     ):
         check_bounds(action_low, action_high)
-        check_counts(horizon=horizon, num_candidates=num_candidates, num_iterations=num_iterations)
+        check_counts(horizon=horizon, num_starts=num_starts, num_iterations=num_iterations)
         check_counts(cem_candidates=cem_candidates, cem_iterations=cem_iterations)
         check_reals("(0, 1]", action_step=action_step, start_std=start_std)
         check_reals("[0, 10]", noise_beta=noise_beta)
@@ -108,7 +108,7 @@ class GradientAscent:
         self.action_low = action_low.detach().clone()
         self.action_high = action_high.detach().clone()
         self.horizon = horizon
-        self.num_candidates = num_candidates
+        self.num_starts = num_starts
         self.num_iterations = num_iterations
         self.optimiser = optimiser
         self.action_step = action_step
@@ -153,7 +153,7 @@ class GradientAscent:
             ValueError: ``plan`` or the objective's result has the wrong shape.
         """
         check_plan(plan, self.initial_plan())
-        low, high, num_rows = self.action_low, self.action_high, self.num_candidates
+        low, high, num_rows = self.action_low, self.action_high, self.num_starts
         best, std = plan.actions.clamp(low, high), (high - low) * self.start_std
         best_score, num_nonfinite, iterations_done = math.nan, 0, 0
         if self.start_from == "cem":

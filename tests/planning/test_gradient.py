@@ -87,7 +87,7 @@ def test_the_best_sequence_that_was_scored_is_the_plan_and_never_worse_than_the_
         seen.append((scores.detach(), actions.detach()))
         return scores
 
-    ascent = planner(2.0, num_candidates=5, num_iterations=4)
+    ascent = planner(2.0, num_starts=5, num_iterations=4)
     start = Sequence(torch.full((H, 2), 0.31, dtype=torch.float64))
     plan, info = ascent.plan(objective, start, seeded())
     scores, actions = torch.cat([each for each, _ in seen]), torch.cat([each for _, each in seen])
@@ -105,10 +105,10 @@ def test_cem_asks_for_values_alone_and_what_it_found_is_climbed_from():
         asked.append((len(actions), actions.requires_grad, actions.detach().clone()))
         return -(actions - 0.7).square().sum((1, 2))
 
-    ascent = planner(2.0, num_candidates=2, num_iterations=3, start_from="cem", cem_candidates=50, cem_iterations=4)
+    ascent = planner(2.0, num_starts=2, num_iterations=3, start_from="cem", cem_candidates=50, cem_iterations=4)
     _, info = ascent.plan(objective, ascent.initial_plan(), seeded())
     assert [each[:2] for each in asked] == [(50, False)] * 4 + [(2, True)] * 3
-    cold = planner(2.0, num_candidates=2, num_iterations=3)
+    cold = planner(2.0, num_starts=2, num_iterations=3)
     _, alone = cold.plan(objective, cold.initial_plan(), seeded())
     assert info.metrics["climbed"] < 0.2 * alone.metrics["climbed"], "less was left to climb"
 
@@ -158,7 +158,7 @@ def test_the_simulator_is_refused_by_name_before_a_step_is_lost():
         ({"start_from": "mppi"}, r"start_from must be one of plan, cem, got 'mppi'"),
         ({"action_step": 0.0}, r"action_step .* 0\.0$"),
         ({"cem_iterations": 0}, "cem_iterations must be at least 1, got 0"),
-        ({"num_candidates": 0}, "num_candidates must be at least 1, got 0"),
+        ({"num_starts": 0}, "num_starts must be at least 1, got 0"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")

@@ -23,8 +23,8 @@ FACTORIES = {
     "cem": partial(CEM, num_candidates=64, num_elites=8, num_iterations=4),
     "icem": partial(ICEM, num_candidates=64, num_elites=8, num_iterations=4),
     "mppi": partial(MPPI, num_candidates=64, num_iterations=4),
-    "gradient, adam": partial(GradientAscent, num_candidates=16, num_iterations=8, optimiser="adam"),
-    "gradient, lbfgs": partial(GradientAscent, num_candidates=16, num_iterations=2, optimiser="lbfgs"),  # 3 are exact
+    "gradient, adam": partial(GradientAscent, num_starts=16, num_iterations=8, optimiser="adam"),
+    "gradient, lbfgs": partial(GradientAscent, num_starts=16, num_iterations=2, optimiser="lbfgs"),  # 3 are exact
     "gradient from cem": partial(GradientAscent, num_iterations=3, start_from="cem", optimiser="adam"),
     "one sequence": partial(RandomShooting, num_candidates=256),
     "elites": partial(ElitesKept, num_candidates=128),
