@@ -56,7 +56,9 @@ def main() -> None:
         wanted = {
             "pets": layers == deepest,  # these networks have layers of their own
             "inductor": layers == deepest and threads == first,
-            "scaling": (threads, name) == (first, arguments.cases[0]) and layers == min(2, deepest),
+            **dict.fromkeys(
+                ("scaling", "knobs"), (threads, name) == (first, arguments.cases[0]) and layers == min(2, deepest)
+            ),
         }
         # More threads are compared where most is to be done.
         if not wanted.get(part, threads == first or layers == deepest):

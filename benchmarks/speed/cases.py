@@ -126,14 +126,18 @@ def planner(case: Case, num_candidates: int = NUM_CANDIDATES) -> CEM:
 
 
 def plan_call(
-    case: Case, model: DynamicsModel, data: Transitions, num_candidates: int = NUM_CANDIDATES
+    case: Case,
+    model: DynamicsModel,
+    data: Transitions,
+    num_candidates: int = NUM_CANDIDATES,
+    num_particles: int = NUM_PARTICLES,
 ) -> Callable[[], None]:
     """One plan from scratch: draw a world, optimise."""
     cem, generator = planner(case, num_candidates), seeded(1)
 
     def plan() -> None:
-        world = model.draw(NUM_PARTICLES, case.horizon, generator)
-        objective = rollout_objective(world, reward, data.observation[0], NUM_PARTICLES)
+        world = model.draw(num_particles, case.horizon, generator)
+        objective = rollout_objective(world, reward, data.observation[0], num_particles)
         cem.plan(objective, cem.initial_plan(), generator)
 
     return plan

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import torch
 
@@ -29,11 +30,14 @@ from benchmarks.speed.cases import (
 from benchmarks.speed.inductor import compiled_step
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.data.standardised import Data
+from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.deep_gp.start import initial_model
 from gym_dgpmpc.inference import sghmc
 from gym_dgpmpc.inference.sampler import Chains, initial_state
 from gym_dgpmpc.inference.training import BURN_IN
 from gym_dgpmpc.planning.rollout import particle_returns, rollout
+from gym_dgpmpc.settings import settings_of
+from gym_dgpmpc.types import Transitions
 
 NUM_TRANSITIONS = 600
 
@@ -70,28 +74,44 @@ def pets(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
         yield {"what": "plan", "how": how} | timed(peers.pets_plan(case, data, **settings), repeats)
 
 
+TOGETHER = 20
+"""Training iterations that are timed together, so that each has its share of what is not done in every one."""
+
+
+def chains(model: DeepGPDynamics, data: Transitions, repeats: int, *, compile: bool = True) -> Chains:
+    """The sampler of a model's posterior, at the beginning of a training that lasts for all repeats."""
+    generator = seeded(0)
+    x, y = model._encode(data)
+    standardised = Data(Normaliser.fit(x)(x), Normaliser.fit(y)(y))
+    start = initial_model(model.kernel, standardised, model.num_layers, model.num_inducing, model.num_chains, generator)
+    whitened = sghmc.init(x.new_zeros(model.num_chains, start.num_whitened()))
+    state = initial_state(start, whitened, standardised.num_rows, generator)
+    burn_in = round(BURN_IN * TOGETHER * (repeats + 2))
+    return Chains(start, state, standardised, model.inference, burn_in, compile=compile)
+
+
+def iteration(run: Chains, repeats: int) -> dict[str, float]:
+    """Milliseconds of a training iteration."""
+    generator = seeded(0)
+
+    def iterate() -> None:
+        for _ in range(TOGETHER):
+            run.step(generator)
+
+    return timed(iterate, repeats, 1 / TOGETHER)
+
+
 def training(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
     """A training iteration and an SG-HMC step alone, both of all chains, and GPyTorch's training step, of one model.
 
-    An iteration is the mean of 20, so that it has its share of steps of the hyperparameters, and of an exact draw.
+    An iteration is the mean of some, so that it has its share of steps of the hyperparameters, and of an exact draw.
     """
     data, generator = transitions(case, NUM_TRANSITIONS), seeded(0)
     model = deep_gp(case, num_layers, data)
-    x, y = model._encode(data)
-    standardised = Data(Normaliser.fit(x)(x), Normaliser.fit(y)(y))
-    start = initial_model(model.kernel, standardised, num_layers, model.num_inducing, model.num_chains, generator)
-    whitened = sghmc.init(x.new_zeros(model.num_chains, start.num_whitened()))
-    together, row = 20, {"what": "training iteration"}
-
-    def iterate(run: Chains) -> None:
-        for _ in range(together):
-            run.step(generator)
-
+    row = {"what": "training iteration"}
     for how, compile in (("this package, PyTorch", False), ("this package", True)):
-        state = initial_state(start, whitened, standardised.num_rows, generator)
-        burn_in, ours = round(BURN_IN * together * (repeats + 2)), {"how": how, "chains": model.num_chains}
-        run = Chains(start, state, standardised, model.inference, burn_in, compile=compile)
-        yield row | ours | timed(partial(iterate, run), repeats, 1 / together)
+        run, ours = chains(model, data, repeats, compile=compile), {"how": how, "chains": model.num_chains}
+        yield row | ours | iteration(run, repeats)
     bare = floor.bare_training(num_layers, BATCH_SIZE, model.num_chains, model.inference.hyperparameters_every)
     yield (
         row
@@ -165,6 +185,44 @@ def scaling(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
         yield {"what": "extra memory, MB"} | varied | {"p50_ms": peak_memory_mb() - before, "repeats": 1}
 
 
+KNOBS: tuple[tuple[str, Any], ...] = (
+    ("nothing", None),
+    ("num_candidates", 600),
+    ("num_iterations", 10),
+    ("horizon", 60),
+    ("num_particles", 10),
+    ("num_layers", 3),
+    ("num_inducing", 200),
+    ("num_features", 128),
+    ("refresh", "step"),
+    ("kernel", "rbf"),
+    ("kernel", "matern12"),
+    ("num_chains", 10),
+    ("batch_size", 512),
+    ("resample_samples", 10),
+)
+"""What is changed of the defaults, one at a time."""
+
+
+def knobs(case: Case, num_layers: int, repeats: int) -> Iterator[Row]:
+    """What a setting costs: a plan, following a transition, and a training iteration, with one changed at a time."""
+    data = transitions(case, NUM_TRANSITIONS)
+    for name, value in KNOBS:
+        given, varied = {name: value}, {"varied": name, "value": value}
+        of_model = {name: value} if name in settings_of(DeepGPDynamics) else {}
+        model = deep_gp(case, of_model.pop("num_layers", num_layers), data, **of_model)
+        sizes = {name: value for name, value in given.items() if name in ("num_candidates", "num_particles")}
+        longer = case._replace(
+            **{name: value for name, value in given.items() if name in ("horizon", "num_iterations")}
+        )
+        yield {"what": "plan"} | varied | timed(plan_call(longer, model, data, **sizes), repeats)
+        if of_model or name in ("nothing", "num_layers"):
+            following = partial(model.resample, data, seeded(0))
+            yield {"what": "following a transition"} | varied | timed(following, repeats)
+            yield {"what": "training iteration"} | varied | iteration(chains(model, data, repeats), repeats)
+
+
 WORKERS = {
     "plans": plans, "pets": pets, "training": training, "parts": parts, "inductor": inductor, "scaling": scaling,
+    "knobs": knobs,
 }  # fmt: skip

@@ -96,6 +96,7 @@ def document(facts: Row, rows: list[Row]) -> str:
         "parts": "Where a plan's time goes",
         "inductor": "By `torch.compile` instead",
         "scaling": "Scaling",
+        "knobs": "One setting changed at a time",
     }
     for worker, title in titles.items():
         if any(row["worker"] == worker for row in rows):
