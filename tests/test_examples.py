@@ -1,16 +1,13 @@
 """The examples run, at a tiny size."""
 
 import math
-import re
 from pathlib import Path
 
-import gymnasium
 import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from examples import own_task, quickstart
-from gym_dgpmpc import settings_for
+from examples import concepts, own_task, quickstart
 
 ROOT = Path(own_task.__file__).parents[1]
 TINY = {
@@ -39,37 +36,17 @@ def test_quickstart(tmp_path, capsys):
     assert "first action at" in printed
 
 
+def test_concepts(tmp_path, monkeypatch):
+    monkeypatch.setattr(concepts, "HORIZON", 2)
+    concepts.main(20, tmp_path, **TINY)
+    assert sorted(picture.name for picture in tmp_path.iterdir()) == ["plan.png", "worlds.png"]
+
+
 def test_own_task():
     agent = own_task.main(episodes=2, **TINY)
     assert agent.is_fitted and agent.num_timesteps == 120
     low, high = agent.store.transitions().next_observation.aminmax(dim=0)
     assert (low >= 0).all() and (high <= 1).all() and (high > low).all()
-
-
-def python_of(page):
-    """The Python of a page, block by block."""
-    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)
-
-
-def test_the_readmes_lines_run(tmp_path, monkeypatch):
-    """With settings that take no time: what the lines name is there, and is called as they call it."""
-    (code,) = python_of("README.md")
-    assert len([line for line in code.splitlines() if line]) <= 6
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gym_dgpmpc.settings_for", lambda env_id: {**settings_for(env_id), **TINY}, raising=False)
-    namespace = {}
-    exec(code.replace("total_timesteps=1_400", "total_timesteps=30"), namespace)
-    assert namespace["agent"].num_timesteps == 30
-    assert namespace["env"].action_space.contains(namespace["action"])
-
-
-def test_the_other_agents_can_be_made_as_the_pages_say():
-    namespace = {"env": gymnasium.make("gym_dgpmpc:ModCartPole-v0")}
-    learning, *others = python_of("docs/using.md")
-    assert "agent.learn(" in learning  # for minutes; `test_quickstart` does the same in less
-    for code in others:
-        exec(code, namespace)
-    assert {namespace[name].num_timesteps for name in ("pets", "gp", "ceiling")} == {0}
 
 
 def test_the_tutorial_shows_the_example():
