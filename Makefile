@@ -12,12 +12,14 @@ INSTALLED := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test fault-test mutation-test lint clean
+.PHONY: help install demo docs docs-links test fault-test mutation-test lint clean
 
 help:
 	@echo "make install   set up .venv with the package and everything its development needs"
 	@echo "make demo      train on ModCartPole-v0 for a few minutes; results in demo/"
-	@echo "make test      lint, then the tests (PYTEST_ARGS=... for pytest)"
+	@echo "make docs      the documentation as a site, in build/docs; a warning is an error"
+	@echo "make docs-links  are the links to other sites alive? (needs the network)"
+	@echo "make test      lint and docs, then the tests (PYTEST_ARGS=... for pytest)"
 	@echo "make fault-test  kill, cut, mutate and soak in full, for more than half an hour; table in benchmarks/results/"
 	@echo "make mutation-test  change the code in many places, one at a time, and see whether a test fails: hours"
 	@echo "make lint      ruff and mypy"
@@ -48,8 +50,18 @@ lint: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# All pages are read anew each time: of a page that has not changed Sphinx would keep its warnings to itself.
+SPHINX = $(BIN)/python -m sphinx -c docs -d build/doctrees -E -q -W --keep-going
+
+docs: $(INSTALLED)
+	$(SPHINX) -b html . build/docs
+	@echo "the site begins at build/docs/index.html"
+
+docs-links: $(INSTALLED)
+	$(SPHINX) -b linkcheck . build/links
+
 # MuJoCo draws off-screen through EGL or OSMesa, whichever works here; with neither, the tests of rendering skip.
-test: lint
+test: lint docs
 	@gl=$${MUJOCO_GL:-$$($(BIN)/python -m gym_dgpmpc.runs.rendering)}; \
 	echo "MUJOCO_GL=$$gl"; \
 	MUJOCO_GL=$$gl $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)

@@ -10,7 +10,7 @@ import gymnasium
 import pytest
 import torch
 
-from gym_dgpmpc import DGPMPCAgent, MPCAgent
+from gym_dgpmpc import DGPMPCAgent
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.planning import PLANNERS, register_planner
 from tests.oracles.models import seeded
@@ -20,10 +20,10 @@ RECIPES = {part.split("\n")[0]: part for part in PAGE.read_text(encoding="utf-8"
 
 
 @functools.cache
-def shown(recipe):
-    """What the recipe's first block of Python defines, as a module, where annotations find what they name."""
-    code = re.findall(r"```python\n(.*?)```", RECIPES[recipe], re.DOTALL)[0]
-    module = types.ModuleType(f"shown_{recipe.split()[-1]}")
+def shown(recipe, block=0):
+    """What a block of the recipe's Python defines, as a module, where annotations find what they name."""
+    code = re.findall(r"```python\n(.*?)```", RECIPES[recipe], re.DOTALL)[block]
+    module = types.ModuleType(f"shown_{recipe.split()[-1]}_{block}")
     sys.modules[module.__name__] = module
     exec(compile(code, PAGE.name, "exec"), vars(module))
     return module
@@ -58,10 +58,9 @@ def test_an_environment_starts_where_it_says():
     env.close()
 
 
-def test_a_model_learns_and_its_agent_has_its_settings():
-    model = shown("A dynamics model").LinearDynamics
-    agent_class = type("LinearMPCAgent", (MPCAgent,), {"__doc__": "An agent.", "dynamics_class": model})
-    agent = agent_class(
+def test_a_model_learns_and_its_agent_has_its_settings(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gym_dgpmpc.dynamics.linear", shown("A dynamics model"))
+    agent = shown("A dynamics model", block=1).LinearMPCAgent(
         gymnasium.make("Pendulum-v1"), ridge=0.1, horizon=2, num_candidates=10, learning_starts=50, seed=0
     )
     agent.learn(60)
