@@ -21,7 +21,7 @@ from benchmarks.tasks import Task
 from gym_dgpmpc.agents import DGPMPCAgent, GPMPCAgent, MixtureMPCAgent, MPCAgent, PETSAgent, presets
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.gp.kernels import KERNELS
-from gym_dgpmpc.planning import PLANNERS, planner_factory
+from gym_dgpmpc.planning.registry import planner_factory, settings_of_others
 from gym_dgpmpc.settings import settings_of
 
 NO_SETTINGS = {
@@ -80,7 +80,7 @@ class PlanningMethod:
         given = {**self.presets(task), **self.fixed, **task.for_planning}
         defaults, planner = _defaults(self.make_agent), {**given, **asked}.get("planner", "cem")
         mine = settings_of(planner_factory(planner))
-        of_others = {name for other in PLANNERS for name in settings_of(planner_factory(other))} - set(mine)
+        of_others = settings_of_others(planner)
         if planner != "cem":  # whose settings the agents' signatures have
             defaults = {**{name: setting.default for name, setting in mine.items()}, **defaults}
         defaults, given = (

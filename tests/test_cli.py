@@ -323,7 +323,7 @@ def test_runs_as_a_module():
 @pytest.mark.parametrize("agent", options.AGENTS)
 def test_every_plain_setting_is_an_option(run, agent):
     """Called as it is, with what it means; `--help` shows the default or says that the preset decides."""
-    shown = re.sub(r"[\s│]+", " ", run_wide("train", "--help"))
+    shown = re.sub(r"[\s│]+", " ", run_wide("train", "--agent", agent, "--help"))
     agent_class, settings_for = options.AGENTS[agent]
     settings = {**agent_class.own_settings(), **agent_class.part_settings("cem")}
     plain = [name for name, setting in settings.items() if setting.annotation in (int, float, bool, str)]

@@ -5,6 +5,7 @@ from types import MappingProxyType
 from typing import Any
 
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.planning.registry import settings_of_others
 from gym_dgpmpc.settings import of_member, settings_of
 
 
@@ -89,24 +90,35 @@ PLANNING = MappingProxyType(
     {
         "ModCartPole-v0": _CART_POLE_PLANNING,
         "SwingUpCartPole-v0": _CART_POLE_PLANNING,
+        # Seven torques over 20 steps: sampling stays far from the top.
+        "BiasedReacher-v0": MappingProxyType({"planner": "gradient"}),
     }
 )
-"""How to plan and to explore where that earns more than the paper's way (docs/planning.md), whatever the model."""
+"""How to plan and to explore where that earns more than the paper's way (docs/planning.md). Planning by gradients is
+for draws of whole functions, as a deep Gaussian process has them; the rest is for any model."""
 
 
 OF_A_TASK: tuple[Mapping[str, Mapping[str, Any]], ...] = (PAPER, STOCK, DEEP_GP, PLANNING)
 """What `settings_for` lays over each other, the later ones over the earlier."""
 
 
-def settings_for(env_id: str) -> Mapping[str, Any]:
+def settings_for(env_id: str, planner: str | None = None) -> Mapping[str, Any]:
     """Settings of `DGPMPCAgent` for a task, none if it has no preset.
 
     Args:
         env_id: id of the environment, with or without a module before it that registers it
             ("gym_dgpmpc.envs.robotics:FetchReachDense-v4").
+        planner: name of a planner in the place of the task's; settings that it does not have are left out.
+
+    Raises:
+        ValueError: no planner is registered under this name.
     """
     task = env_id.rpartition(":")[2]
-    return {name: value for table in OF_A_TASK for name, value in table.get(task, {}).items()}
+    settings = {name: value for table in OF_A_TASK for name, value in table.get(task, {}).items()}
+    if planner is not None:
+        settings["planner"] = planner
+    others = settings_of_others(settings.get("planner", "cem"))
+    return {name: value for name, value in settings.items() if name not in others}
 
 
 REAL_TIME = MappingProxyType(
@@ -184,4 +196,6 @@ def mixture_settings_for(env_id: str) -> Mapping[str, Any]:
     Args:
         env_id: as in `settings_for`.
     """
-    return for_mixture(settings_for(env_id), NETWORKS.get(env_id.rpartition(":")[2], {}))
+    # Networks have fresh noise at each call, with which L-BFGS does not climb.
+    climbs = settings_for(env_id).get("planner") == "gradient"
+    return for_mixture(settings_for(env_id, "cem" if climbs else None), NETWORKS.get(env_id.rpartition(":")[2], {}))

@@ -13,6 +13,7 @@ from gym_dgpmpc.planning.cem import CEM
 from gym_dgpmpc.planning.gradient import GradientAscent
 from gym_dgpmpc.planning.icem import ICEM
 from gym_dgpmpc.planning.mppi import MPPI
+from gym_dgpmpc.settings import settings_of
 from gym_dgpmpc.types import Planner, PlannerFactory
 
 PLANNERS: dict[str, PlannerFactory] = {"cem": CEM, "icem": ICEM, "mppi": MPPI, "gradient": GradientAscent}
@@ -60,6 +61,12 @@ def planner_factory(planner: str | PlannerFactory | Planner) -> PlannerFactory:
     if not callable(planner):
         raise TypeError(f"planner must be a name, a class or function that makes one, or an object, got {planner!r}")
     return planner
+
+
+def settings_of_others(planner: str | PlannerFactory) -> set[str]:
+    """Names that are settings of other registered planners, and not of this one."""
+    own = settings_of(planner_factory(planner))
+    return {name for factory in PLANNERS.values() for name in settings_of(factory)} - set(own)
 
 
 def make_planner(
