@@ -166,6 +166,15 @@ class ReportsProgress(Protocol):
     on_progress: ProgressFn | None
 
 
+@runtime_checkable
+class ReportsDiagnostics(Protocol):
+    """A `DynamicsModel` that says how well it is fitted, also after it was loaded; other models need not."""
+
+    def diagnostics(self) -> Mapping[str, float]:
+        """Numbers by the names under which `fit` reports them; none before the first fit."""
+        ...
+
+
 DynamicsFactory = Callable[[int, int, ObservationSpec], DynamicsModel]
 """(observation size, action size, how to read the observation) -> an untrained model of such transitions."""
 

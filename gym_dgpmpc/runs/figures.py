@@ -9,8 +9,9 @@ import re
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
+import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
@@ -25,6 +26,22 @@ BANDS = {0.9: 0.2, 0.5: 0.35}
 """The bands of a fan, widest first: probability inside -> opacity."""
 
 WIDEST = max(BANDS)
+
+FORMATS = ("png", "pdf", "svg")
+"""What figures are drawn in, the first where nothing else is asked for."""
+
+Paths = str | Path | Sequence[Path]
+"""A file, or the same figure's files of several formats; the suffix decides which."""
+
+NO_DATES: dict[str, dict[str, str | None]] = {
+    "png": {"Software": None},
+    "pdf": {"CreationDate": None},
+    "svg": {"Date": None},
+}
+"""By format, metadata without what differs from one day or version to the next."""
+
+RETURN = "return (sum of the episode's rewards)"
+"""Label of an axis."""
 
 NUM_SAMPLE_PATHS = 3
 MAX_DIMENSIONS = 12
@@ -44,7 +61,7 @@ class Forecast(NamedTuple):
 
 def plot_learning_curve(
     returns: Sequence[float],
-    path: str | Path,
+    path: Paths,
     *,
     title: str,
     num_random: int = 1,
@@ -54,7 +71,7 @@ def plot_learning_curve(
 
     Args:
         returns: one per episode, the random ones included.
-        path: the file; its suffix decides the format.
+        path: the file or files; their suffix decides the format.
         title: what was trained on what.
         num_random: how many episodes, from the first, acted at random.
         episode_steps: environment steps of each episode; the lower axis then says how many were taken in all.
@@ -77,7 +94,7 @@ def plot_learning_curve(
         axes.scatter(episodes[:num_random], returns[:num_random], color=RANDOM_COLOUR, zorder=2, label="random actions")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("episode" if episode_steps is None else f"episode ({sum(episode_steps)} environment steps in all)")
-    axes.set_ylabel("return (sum of the episode's rewards)")
+    axes.set_ylabel(RETURN)
     axes.set_title(title)
     axes.grid(alpha=0.3)
     axes.legend(loc="best")
@@ -86,7 +103,7 @@ def plot_learning_curve(
 
 def plot_prediction_fan(
     forecasts: Sequence[Forecast],
-    path: str | Path,
+    path: Paths,
     *,
     labels: Sequence[str],
     title: str,
@@ -100,7 +117,7 @@ def plot_prediction_fan(
 
     Args:
         forecasts: at least one, all of the same observation size S.
-        path: the file; its suffix decides the format.
+        path: the file or files; their suffix decides the format.
         labels: S texts with units.
         title: the figure's heading.
         step_seconds: duration of an environment step, if it is known.
@@ -135,21 +152,28 @@ def plot_prediction_fan(
     write_figure(figure, path, dpi=130)
 
 
-def write_figure(figure: Figure, path: str | Path, *, dpi: int) -> None:
-    """Write a picture, whole or not at all; the same numbers give the same PNG file.
+def write_figure(figure: Figure, path: Paths, *, dpi: int) -> None:
+    """Write a picture, whole or not at all; the same numbers give the same file.
 
     Args:
         figure: what is drawn.
-        path: the file; its suffix decides the format.
+        path: the file or files; their suffix decides the format.
         dpi: dots per inch.
 
     Raises:
         OSError: it cannot be written; an old file is untouched.
     """
-    path = Path(path)
-    kind = path.suffix.removeprefix(".") or "png"
-    metadata = {"Software": None} if kind == "png" else None
-    replace_file(path, lambda file: figure.savefig(file, format=kind, dpi=dpi, metadata=metadata))
+    figure.dpi = dpi
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # it would begin where the file before left it
+    for each in [Path(path)] if isinstance(path, str | Path) else path:
+        kind = each.suffix.removeprefix(".") or FORMATS[0]
+
+        def save(file: IO[bytes], kind: str = kind) -> None:
+            with matplotlib.rc_context({"svg.hashsalt": ""}):  # else the names within an SVG are random
+                figure.savefig(file, format=kind, dpi=dpi, metadata=NO_DATES.get(kind))
+
+        replace_file(each, save)
 
 
 def observation_labels(env_class: type, size: int) -> list[str]:

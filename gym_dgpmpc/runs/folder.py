@@ -2,7 +2,8 @@
 
 It holds `settings.json` (what was asked, with which versions), `episodes.csv` (raw results), `agent.zip` (and
 `agent.previous.zip`, the one before), `tensorboard/`, and when the run ends `learning_curve.png`, `prediction_fan.png`
-and `last_episode.gif`. `training.py` fills it; the benchmarks read the same files.
+with its numbers in `prediction_fan.npz`, and `last_episode.gif`. `training.py` fills it; `plotting.py`, `inspection.py`
+and the benchmarks read the same files.
 """
 
 import csv
@@ -18,10 +19,19 @@ from typing import Any, NamedTuple
 from gym_dgpmpc.checkpoints.files import replace_text
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.errors import DGPMPCError
+from gym_dgpmpc.runs.figures import FORMATS
 from gym_dgpmpc.runs.provenance import machine, revision, versions
 
 SETTINGS_FILE, EPISODES_FILE, LOGS = "settings.json", "episodes.csv", "tensorboard"
-FIGURES = LEARNING_CURVE, PREDICTION_FAN, LAST_EPISODE = "learning_curve.png", "prediction_fan.png", "last_episode.gif"
+LEARNING_CURVE, PREDICTION_FAN = "learning_curve", "prediction_fan"
+"""Names of figures, whose suffix is their format."""
+FORECASTS, LAST_EPISODE = f"{PREDICTION_FAN}.npz", "last_episode.gif"
+PICTURES = (
+    FORECASTS,
+    LAST_EPISODE,
+    *(f"{name}.{kind}" for name in (LEARNING_CURVE, PREDICTION_FAN) for kind in FORMATS),
+)
+"""All that a run draws, in any format, and what is kept to draw it again."""
 
 
 class RunFolderError(DGPMPCError, ValueError):
@@ -78,6 +88,24 @@ def read_rows(path: Path) -> list[EpisodeRow]:
         return [EpisodeRow.from_text(row) for row in csv.DictReader(file)]
 
 
+def read_settings(path: Path) -> dict[str, Any]:
+    """What is in the `settings.json` of a run's folder, "settings" among it.
+
+    Raises:
+        RunFolderError: there is none, or it is not one of a run.
+    """
+    file = path / SETTINGS_FILE
+    if not file.is_file():
+        raise RunFolderError(f"expected a folder of `dgpmpc train`, but there is no file {file}")
+    try:
+        content = json.loads(file.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise RunFolderError(f"{file} cannot be read: {error}") from error
+    if not isinstance(content, dict) or not isinstance(content.get("settings"), dict):
+        raise RunFolderError(f"{file} is not one of a run: it has no object of settings")
+    return content
+
+
 class RunFolder:
     """The files of one run, held by this process until `close`.
 
@@ -111,7 +139,7 @@ class RunFolder:
         try:
             if overwrite:
                 self.checkpoints.delete()
-                for name in (SETTINGS_FILE, EPISODES_FILE, *FIGURES):
+                for name in (SETTINGS_FILE, EPISODES_FILE, *PICTURES):
                     (path / name).unlink(missing_ok=True)
                 shutil.rmtree(path / LOGS, ignore_errors=True)
             self.goes_on = self.checkpoints.exist
@@ -143,7 +171,7 @@ class RunFolder:
 
     def read_settings(self) -> dict[str, Any]:
         """What `write_settings` wrote the last time."""
-        return json.loads((self.path / SETTINGS_FILE).read_text())
+        return read_settings(self.path)
 
     def rows(self) -> list[EpisodeRow]:
         """All episodes so far."""
@@ -158,10 +186,8 @@ class RunFolder:
     def _refuse_other_settings(self) -> None:
         try:
             before = {**self._defaults, **self.read_settings()["settings"]}
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise RunFolderError(
-                f"{self.path} holds an agent, but {SETTINGS_FILE} cannot be read ({error}): {self._advice}"
-            ) from error
+        except RunFolderError as error:
+            raise RunFolderError(f"{self.path} holds an agent, but {error}: {self._advice}") from error
         differing = [
             f"{name} was {before.get(name)}, now {self.settings.get(name)}"
             for name in sorted({*before, *self.settings})

@@ -4,7 +4,7 @@
 wall-clock times differ then from those of a run that was not.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import gymnasium
@@ -12,8 +12,10 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from gym_dgpmpc.agents import MPCAgent
 from gym_dgpmpc.checkpoints.safeguard import resume_from
-from gym_dgpmpc.runs.figures import observation_labels, plot_learning_curve, plot_prediction_fan
-from gym_dgpmpc.runs.folder import LAST_EPISODE, LEARNING_CURVE, LOGS, PREDICTION_FAN, EpisodeRow, RunFolder
+from gym_dgpmpc.runs.figures import FORMATS, observation_labels
+from gym_dgpmpc.runs.folder import FORECASTS, LAST_EPISODE, LOGS, EpisodeRow, RunFolder
+from gym_dgpmpc.runs.forecasts import KeptForecasts
+from gym_dgpmpc.runs.plotting import draw_run
 from gym_dgpmpc.runs.recording import EpisodeRecorder, ForecastCallback
 from gym_dgpmpc.runs.rendering import write_gif
 
@@ -46,6 +48,7 @@ class TrainingRun:
             of an episode that was given up when the run was interrupted do not count.
         checkpoint_every: see `MPCAgent.learn`.
         title: heading of the figures.
+        formats: of the figures; some of `FORMATS`.
         results_only: print nothing, draw nothing, and skip the training after the last episode, which comes first if
             the run goes on to more episodes.
 
@@ -63,10 +66,12 @@ class TrainingRun:
         total_timesteps: int,
         checkpoint_every: int | None = None,
         title: str = "",
+        formats: Sequence[str] = FORMATS[:1],
         results_only: bool = False,
     ):
         self.folder, self.num_episodes, self.total_timesteps = folder, num_episodes, total_timesteps
-        self.checkpoint_every, self.title, self.results_only = checkpoint_every, title, results_only
+        self.checkpoint_every, self.results_only = checkpoint_every, results_only
+        self.title, self.formats = title, formats
         self.recorder = EpisodeRecorder(env)
         logs = str(folder.path / LOGS)
         self.agent = make_agent(self.recorder, verbose=0 if results_only else 1, tensorboard_log=logs)
@@ -119,29 +124,19 @@ class TrainingRun:
 
     def write_figures(self, title: str) -> list[Path]:
         """Draw what there is to draw, and return the files that were written."""
-        rows, written = self.folder.rows(), []
-        if rows:
-            written.append(self.folder.path / LEARNING_CURVE)
-            plot_learning_curve(
-                [row.episode_return for row in rows],
-                written[-1],
-                title=title,
-                num_random=sum(row.actions == "random" for row in rows),
-                episode_steps=[row.steps for row in rows],
-            )
+        path = self.folder.path
         if self.forecasts is not None and self.forecasts.forecasts:
-            env = self.recorder.unwrapped
-            written.append(self.folder.path / PREDICTION_FAN)
-            plot_prediction_fan(
+            env, rows = self.recorder.unwrapped, self.folder.rows()
+            KeptForecasts(
                 self.forecasts.forecasts,
-                written[-1],
-                labels=observation_labels(type(env), self.agent.observation_space.shape[0]),
-                title=f"Predicted before it happened: episode {rows[-1].episode}, {title}",
+                observation_labels(type(env), self.agent.observation_space.shape[0]),
+                episode=rows[-1].episode,
                 step_seconds=getattr(env, "dt", None),
-            )
+            ).write(path / FORECASTS)
+        written = draw_run(path, title, self.formats)
         last = self.recorder.last
         if last is not None and last.frames:
-            written.append(self.folder.path / LAST_EPISODE)
+            written.append(path / LAST_EPISODE)
             write_gif(last.frames, written[-1], last.frames_per_second)
         return written
 

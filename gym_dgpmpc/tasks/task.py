@@ -82,6 +82,7 @@ class Task:
             self._found = self.find(env)
         # Of the file that the agent was loaded from: what it says of its environment, for the next file.
         self._loaded_about: dict[str, Any] = {}
+        self._loaded_sources: dict[str, Any] = {}
         self._had_terminated_fn = False
         self._has_warned = False
         self.can_model_more = True
@@ -255,8 +256,15 @@ class Task:
             "never_terminates": self._said_never,
             "is_exact": self.is_exact,
             "has_terminated_fn": has_terminated_fn or self.lacks_terminated_fn,
+            "sources": self._sources(),
             "about_environment": self.about_environment(),
         }
+
+    def _sources(self) -> dict[str, Any]:
+        """Where reward and termination come from, for who looks into a file; of a loaded agent, what its own said."""
+        if self._found is None:
+            return self._loaded_sources
+        return {"reward_fn": self._found.reward_source, "terminated_fn": self._found.terminated_source}
 
     def load_state_dict(self, state: StateDict) -> None:
         """Take over what a file says of its environment, and what its model predicted.
@@ -277,6 +285,8 @@ class Task:
             self.model(reward=reward, terminated=terminated)
         self.is_exact = bool(state.get("is_exact", False))  # older files do not say
         self._loaded_about, self._had_terminated_fn = about, had_terminated_fn
+        sources = state.get("sources")  # older files do not say
+        self._loaded_sources = sources if isinstance(sources, dict) else {}
         self._forget_planned()
 
     def _forget_planned(self) -> None:

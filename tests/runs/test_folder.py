@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from gym_dgpmpc.runs.folder import FIGURES, LOGS, SETTINGS_FILE, EpisodeRow, RunFolder, RunFolderError, read_rows
+from gym_dgpmpc.runs.folder import LOGS, PICTURES, SETTINGS_FILE, EpisodeRow, RunFolder, RunFolderError, read_rows
 
 SETTINGS = {"environment": "ToyPush-v0", "seed": 0}
 ROWS = [EpisodeRow(1, "planned", -0.125, 12, 12, 2.5, 1.25)]
@@ -17,7 +17,7 @@ def finished(tmp_path):
     folder.write_settings()
     folder.write_rows(ROWS)
     folder.close()
-    for name in ("agent.zip", "agent.previous.zip", *FIGURES):
+    for name in ("agent.zip", "agent.previous.zip", *PICTURES):
         (tmp_path / name).touch()
     (tmp_path / LOGS).mkdir()
     return tmp_path

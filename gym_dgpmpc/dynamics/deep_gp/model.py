@@ -324,6 +324,10 @@ class DeepGPDynamics(Learner[Fitted]):
         rows = torch.stack([spread_over(samples, math.ceil(rounds / samples))[:rounds] for _ in range(chains)], dim=1)
         return chain, rows[torch.arange(num_particles, dtype=torch.int64, device=self.device) // chains, chain]
 
+    def diagnostics(self) -> dict[str, float]:
+        """Mixing of the samples that are kept now, noise and kernel scales; see `Fitted.diagnostics`."""
+        return {} if self._fitted is None else self._fitted.diagnostics()
+
     def state_dict(self) -> StateDict:
         """Hyperparameters, normalisers, the chain and the whole pool of samples; empty before the first fit."""
         if self._fitted is None:

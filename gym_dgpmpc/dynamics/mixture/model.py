@@ -24,7 +24,14 @@ from gym_dgpmpc.dynamics.predictive import Predictive
 from gym_dgpmpc.dynamics.sparse_gp.model import SparseGPDynamics
 from gym_dgpmpc.dynamics.state import take_tensor
 from gym_dgpmpc.settings import of_member, refuse_unknown, settings_of
-from gym_dgpmpc.types import ObservationSpec, ProgressFn, StateDict, Transitions, TransitionSampler
+from gym_dgpmpc.types import (
+    ObservationSpec,
+    ProgressFn,
+    ReportsDiagnostics,
+    StateDict,
+    Transitions,
+    TransitionSampler,
+)
 
 Member = DeepGPDynamics | SparseGPDynamics | EnsembleDynamics
 
@@ -153,8 +160,7 @@ class MixtureDynamics(Learner[_Fitted]):
         log_density = self._recent(len(data.action))
         weights = stacking_weights(log_density)
         self._fitted = _Fitted(weights, log_density, len(data.action))
-        metrics |= {of_member(name, "weight"): float(w) for name, w in zip(self.models, weights, strict=True)}
-        return metrics | {"num_held_out": float(len(log_density))}
+        return metrics | self._weights_by_name(weights) | {"num_held_out": float(len(log_density))}
 
     def resample(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
         """Let the members predict what is held out of the new transitions, then follow the data as each does.
@@ -201,6 +207,19 @@ class MixtureDynamics(Learner[_Fitted]):
         overall = (weights * mean).sum(0)
         spread = (weights * (variance + (mean - overall).square())).sum(0)
         return Predictive(overall, spread, (log_weights[:, None] + log_density).logsumexp(0))
+
+    def diagnostics(self) -> dict[str, float]:
+        """The weight of each member, and what it says itself, under its name."""
+        if self._fitted is None:
+            return {}
+        metrics = self._weights_by_name(self._fitted.weights)
+        for name, member in self.models.items():
+            if isinstance(member, ReportsDiagnostics):
+                metrics |= {of_member(name, each): value for each, value in member.diagnostics().items()}
+        return metrics
+
+    def _weights_by_name(self, weights: Float[Tensor, "M"]) -> dict[str, float]:
+        return {of_member(name, "weight"): float(w) for name, w in zip(self.models, weights, strict=True)}
 
     def state_dict(self) -> StateDict:
         """Those of the members, each under its name, with the weights and what they rest on; empty before a fit."""
