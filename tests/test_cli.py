@@ -22,7 +22,7 @@ from gym_dgpmpc.agents.presets import NETWORKS, OF_A_TASK, PLANNING, mixture_set
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.checkpoints.format import read_checkpoint
 from gym_dgpmpc.cli import options
-from gym_dgpmpc.cli.train import _fill_in
+from gym_dgpmpc.cli.request import fill_in
 from gym_dgpmpc.dynamics.deep_gp.draws import DRAWS, REFRESHES
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.planning import PLANNERS, register_planner
@@ -62,6 +62,7 @@ def test_train_and_evaluate(run, tmp_path, drawable):
         "episodes.csv",
         "last_episode.gif",
         "learning_curve.png",
+        "prediction_fan.npz",
         "prediction_fan.png",
         "settings.json",
         "tensorboard",
@@ -338,12 +339,12 @@ def test_every_plain_setting_is_an_option(run, agent):
 
 def test_the_preset_chooses_the_planner_unless_another_is_asked_for():
     better = PLANNING["ModCartPole-v0"]
-    filled = _fill_in(
+    filled = fill_in(
         "ModCartPole-v0", {"planner": None, "noise_beta": None, "exploration": None, "num_candidates": None}
     )
     assert filled == {**filled, **better, "num_candidates": 300}
     asked = {"planner": "cem", "noise_beta": None, "exploration": None, "smoothing": None}
-    assert "noise_beta" not in _fill_in("ModCartPole-v0", asked)
+    assert "noise_beta" not in fill_in("ModCartPole-v0", asked)
     shown = re.sub(r"[\s│]+", " ", run_wide("train", "--help"))
     assert "[default: (cem or the preset's for ENV_ID)]" in shown
 
@@ -416,7 +417,7 @@ def test_a_mixture_of_models(run, drawable):
     assert is_one_line_error(run(*command, "--layers=2"), "mixture", "num_layers", "deep_gp_num_layers")
     env_id = "VelocityHalfCheetah-v0"
     preset = mixture_settings_for(env_id)
-    assert _fill_in(env_id, dict.fromkeys(preset), "mixture") == {**preset, "planner": "cem"}
+    assert fill_in(env_id, dict.fromkeys(preset), "mixture") == {**preset, "planner": "cem"}
 
 
 def test_a_run_from_before_a_setting_existed_goes_on(run):

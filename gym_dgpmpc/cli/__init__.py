@@ -1,4 +1,5 @@
-"""The command line: `dgpmpc train ENV_ID`, `evaluate PATH`, `distil PATH`, in a clone `bench SUITE` and `report DIR`.
+"""The command line: `dgpmpc train ENV_ID`, `evaluate PATH`, `inspect PATH`, `plot FOLDER...`, `distil PATH`; in a clone
+`bench SUITE` and `report DIR`.
 
 Says what is wrong in one line, with exit code 2; stops with 130 after Ctrl-C and with 143 after SIGTERM. What is slow
 to import is imported when a command runs, so that `--help` answers at once.
@@ -12,7 +13,7 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 import gym_dgpmpc  # noqa: F401  # registers the environments
-from gym_dgpmpc.cli import benchmarks, distil, evaluate, train
+from gym_dgpmpc.cli import benchmarks, distil, evaluate, inspect, plot, train
 
 
 def _train() -> None:
@@ -57,5 +58,7 @@ def main(
 # In the order in which `dgpmpc --help` shows them.
 app.command("train")(_train)
 app.command()(evaluate.evaluate)
+app.command()(inspect.inspect)
+app.command()(plot.plot)
 app.command()(distil.distil)
 benchmarks.add_benchmarks(app)

@@ -16,7 +16,8 @@ import typer
 
 from gym_dgpmpc.agents import DGPMPCAgent, DynaAgent, MixtureMPCAgent, MPCAgent, presets
 from gym_dgpmpc.agents.composition import model_settings
-from gym_dgpmpc.cli.train import DEFAULT_AGENT, RUN
+from gym_dgpmpc.cli.request import DEFAULT_AGENT
+from gym_dgpmpc.cli.train import RUN
 from gym_dgpmpc.dynamics.mixture.model import MEMBERS
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.planning.registry import PLANNERS, planner_factory

@@ -12,25 +12,40 @@ import typer
 from gym_dgpmpc.cli.common import (
     EXIT_INTERRUPTED,
     EXIT_TERMINATED,
+    FigureFormat,
     make,
     one_line_errors,
     prepare_video,
     use_threads,
 )
-from gym_dgpmpc.settings import refuse_unknown
+from gym_dgpmpc.cli.request import (
+    DEFAULT_AGENT,
+    DEFAULT_EPISODES,
+    Request,
+    fill_in,
+    identifying,
+    new_request,
+    resumed_request,
+)
 
 if TYPE_CHECKING:
     from gym_dgpmpc.runs.training import TrainingRun
 
-DEFAULT_EPISODES = 15
-DEFAULT_AGENT = "dgp-mpc"
 RUN = "Run"
 
 
 def train(
     env_id: Annotated[
-        str, typer.Argument(metavar="ENV_ID", help="Gymnasium id of the environment, such as ModCartPole-v0.")
-    ],
+        str | None, typer.Argument(metavar="ENV_ID", help="Gymnasium id of the environment, such as ModCartPole-v0.")
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Go on with the run in a folder, with all that it was begun with, in place of ENV_ID.",
+            rich_help_panel=RUN,
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -58,12 +73,23 @@ def train(
         ),
     ] = None,
     seed: Annotated[
-        int, typer.Option(min=0, help="Seed of everything random, the environment included.", rich_help_panel=RUN)
-    ] = 0,
+        int | None,
+        typer.Option(
+            min=0,
+            help="Seed of everything random, the environment included.",
+            show_default="0",
+            rich_help_panel=RUN,
+        ),
+    ] = None,
     threads: Annotated[
-        int,
-        typer.Option(min=1, help="CPU threads. More than one helps only on idle cores.", rich_help_panel=RUN),
-    ] = 1,
+        int | None,
+        typer.Option(
+            min=1,
+            help="CPU threads. More than one helps only on idle cores.",
+            show_default="1",
+            rich_help_panel=RUN,
+        ),
+    ] = None,
     progress: Annotated[
         bool | None,
         typer.Option(
@@ -71,9 +97,23 @@ def train(
         ),
     ] = None,
     video: Annotated[
-        bool,
-        typer.Option("--video/--no-video", help="Write a GIF of the last episode; needs OpenGL.", rich_help_panel=RUN),
-    ] = True,
+        bool | None,
+        typer.Option(
+            "--video/--no-video",
+            help="Write a GIF of the last episode; needs OpenGL.",
+            show_default="video",
+            rich_help_panel=RUN,
+        ),
+    ] = None,
+    formats: Annotated[
+        list[FigureFormat] | None,
+        typer.Option(
+            "--format",
+            help="Format of the figures; may be given several times.",
+            show_default="png",
+            rich_help_panel=RUN,
+        ),
+    ] = None,
     checkpoint_every: Annotated[
         int | None,
         typer.Option(
@@ -87,16 +127,32 @@ def train(
 
     Options that you leave out come from the preset for ENV_ID, if there is one, else from the agent's defaults.
     """
-    agent = asked.pop("agent") or DEFAULT_AGENT
-    with one_line_errors(ValueError, TypeError):
-        arguments = _fill_in(env_id, {**asked, "seed": seed}, agent)
-    with one_line_errors(ValueError, AssertionError, OSError):
+    options = {
+        "episodes": episodes,
+        "timesteps": timesteps,
+        "threads": threads,
+        "video": video,
+        "checkpoint_every": checkpoint_every,
+        "formats": [each.value for each in formats] if formats else None,
+    }
+    with one_line_errors(ValueError, TypeError, OSError):
         if episodes is not None and timesteps is not None:
             raise ValueError("give either --episodes or --timesteps, not both")
-        use_threads(threads)
-        no_video = prepare_video(env_id) if video else "--no-video was given"
-        env = make(env_id, render=not no_video)
-        run = _set_up_run(env, agent, arguments, out, overwrite, episodes, timesteps, checkpoint_every)
+        agent, given = asked.pop("agent"), {**asked, "seed": seed}
+        if resume is not None:
+            if overwrite or out is not None:
+                raise ValueError("--resume goes on in its folder: give neither --out nor --overwrite with it")
+            request = resumed_request(resume, env_id, agent, given, options)
+        elif env_id is not None:
+            request = new_request(env_id, out, agent, given, options)
+        else:
+            raise ValueError("give ENV_ID, the environment to learn in, or --resume FOLDER")
+    with one_line_errors(ValueError, AssertionError, OSError):
+        use_threads(request.options["threads"])
+        video = request.options["video"]
+        no_video = prepare_video(request.env_id) if video else "--no-video was given"
+        env = make(request.env_id, render=not no_video)
+        run = _set_up_run(env, request, overwrite)
     if run.is_complete:
         typer.echo(f"the run in {run.folder.path} has finished: ask for more --episodes, or --overwrite it")
         return
@@ -107,7 +163,9 @@ def train(
         with one_line_errors():
             run.train(progress_bar=os.isatty(1) if progress is None else progress)
     except (KeyboardInterrupt, SystemExit) as stop:
-        typer.echo(f"\ninterrupted; the same command goes on from the checkpoint in {run.folder.path}")
+        path = run.folder.path
+        told = f"the same command goes on from the checkpoint in {path}, and so does dgpmpc train --resume {path}"
+        typer.echo(f"\ninterrupted; {told}")
         raise typer.Exit(EXIT_TERMINATED if isinstance(stop, SystemExit) else EXIT_INTERRUPTED) from None
     finally:
         run.folder.close()
@@ -115,38 +173,32 @@ def train(
     if video and no_video:
         typer.echo(f"no GIF: {no_video}")
     typer.echo(
-        f"next: dgpmpc evaluate {run.folder.path}; the same command with more --episodes learns on; "
-        f"tensorboard --logdir {run.folder.path} shows the logs"
+        f"next: dgpmpc evaluate {run.folder.path}; dgpmpc train --resume {run.folder.path} with more --episodes learns "
+        f"on; tensorboard --logdir {run.folder.path} shows the logs"
     )
 
 
-def _set_up_run(
-    env: gymnasium.Env,
-    agent: str,
-    arguments: dict[str, Any],
-    out: Path | None,
-    overwrite: bool,
-    episodes: int | None,
-    timesteps: int | None,
-    checkpoint_every: int | None,
-) -> "TrainingRun":
-    """The run that the options describe."""
+def _set_up_run(env: gymnasium.Env, request: Request, overwrite: bool) -> "TrainingRun":
+    """The run that is asked for."""
     from gym_dgpmpc.cli.options import AGENTS
     from gym_dgpmpc.runs.folder import RunFolder
+    from gym_dgpmpc.runs.plotting import title_of
     from gym_dgpmpc.runs.training import TrainingRun, step_limit
 
     assert env.spec is not None
-    env_id, max_steps = env.spec.id, env.spec.max_episode_steps
+    env_id, max_steps, (_, agent, arguments, options, out) = env.spec.id, env.spec.max_episode_steps, request
+    episodes, timesteps = options.pop("episodes"), options.pop("timesteps")
     if timesteps is None:
         if max_steps is None:
             raise ValueError(f"episodes of {env_id} have no time limit, so they may never end: give --timesteps")
         episodes = episodes or DEFAULT_EPISODES
         timesteps = step_limit(episodes, max_steps, arguments["learning_starts"])
+    as_default = fill_in(env_id, dict.fromkeys(arguments) | {"planner": arguments["planner"]}, agent)
+    settings = {"environment": env_id, "agent": agent, **identifying(arguments, agent)}
     folder = RunFolder(
         out or Path("runs") / f"{env_id}-seed{arguments['seed']}",
-        {"environment": env_id, "agent": agent, **_identifying(arguments, agent)},
-        defaults={"agent": DEFAULT_AGENT}
-        | _identifying(_fill_in(env_id, dict.fromkeys(arguments) | {"planner": arguments["planner"]}, agent), agent),
+        settings,
+        defaults={"agent": DEFAULT_AGENT, **identifying(as_default, agent)},
         overwrite=overwrite,
     )
     try:
@@ -156,50 +208,15 @@ def _set_up_run(
             partial(AGENTS[agent].agent_class, **arguments),
             num_episodes=episodes,
             total_timesteps=timesteps,
-            checkpoint_every=checkpoint_every,
-            title=f"{env_id}, {_model(arguments)}, seed {arguments['seed']}",
+            checkpoint_every=options["checkpoint_every"],
+            title=title_of(settings),
+            formats=options["formats"],
         )
-        folder.write_settings(episodes=episodes, timesteps=timesteps)
+        folder.write_settings(episodes=episodes, timesteps=timesteps, options={"env_id": request.env_id, **options})
     except BaseException:
         folder.close()
         raise
     return run
-
-
-def _model(arguments: dict[str, Any]) -> str:
-    """What a title says of the agent's model."""
-    if "members" in arguments:
-        return " and ".join(arguments["members"])
-    return f"L = {arguments['num_layers']}, {arguments['kernel']}"
-
-
-def _fill_in(env_id: str, asked: dict[str, Any], agent: str = DEFAULT_AGENT) -> dict[str, Any]:
-    """Every argument: as given, else from the preset for the environment, else the agent's default.
-
-    Raises:
-        TypeError: a setting that the agent with this planner does not have was given.
-    """
-    from gym_dgpmpc.cli.options import AGENTS
-
-    agent_class, settings_for = AGENTS[agent]
-    given, preset = {name: value for name, value in asked.items() if value is not None}, settings_for(env_id)
-    planner = given.setdefault("planner", preset.get("planner", "cem"))
-    known = {**agent_class.own_settings(), **agent_class.part_settings(planner)}
-    others = {"planner", "reward_fn", "terminated_fn"}
-    refuse_unknown(f"an agent {agent} that plans by {planner}", given, {*known, *others})
-    filled = {name: known[name].default if name in known else None for name in asked if name in {*known, *others}}
-    filled |= {name: value for name, value in preset.items() if name in known}
-    if "num_candidates" in given and "num_elites" in filled:
-        filled["num_elites"] = None  # the preset's elites are a part of the preset's candidates
-    return filled | given
-
-
-def _identifying(arguments: dict[str, Any], agent: str) -> dict[str, Any]:
-    """The arguments that tell one run from another; settings that depend on the machine do not."""
-    from gym_dgpmpc.cli.options import AGENTS
-
-    settings = AGENTS[agent].agent_class.part_settings(arguments["planner"])
-    return {name: value for name, value in arguments.items() if name not in settings or settings[name].is_saved}
 
 
 def _summarise(run: "TrainingRun", seconds: float) -> None:
