@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gym_dgpmpc.formats import FORMATS, FigureFormat
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -203,6 +205,14 @@ def report(
             show_default="the paper's best, or Gymnasium's",
         ),
     ] = None,
+    formats: Annotated[
+        list[FigureFormat] | None,
+        typer.Option(
+            "--format",
+            help="Format of the figures; may be given several times, and the page shows the first.",
+            show_default="png",
+        ),
+    ] = None,
 ) -> None:
     """Make tables and figures from a folder of result files: of runs, or of the contact study."""
     from benchmarks.contact.report import report_contact_study
@@ -211,17 +221,27 @@ def report(
     from gym_dgpmpc.cli.common import one_line_errors
 
     thresholds = dict(map(_threshold, threshold or ()))
+    drawn = [each.value for each in formats or ()]
     options = {"--out": [str(out)], "--task": task, "--reference": [reference], "--threshold": threshold}
+    options["--format"] = drawn
     given = [part for name, values in options.items() for value in values or () if value for part in (name, value)]
     command = shlex.join(["dgpmpc", "report", str(folder), *given])
     with one_line_errors(ValueError, OSError):
         if holds_contact_study(folder):
             if task or reference or threshold:
-                raise ValueError(f"the report of the contact study has no option but --out, got {shlex.join(given)}")
-            files = report_contact_study(folder, out)
+                raise ValueError(
+                    f"the report of the contact study has no options but --out and --format, got {shlex.join(given)}"
+                )
+            files = report_contact_study(folder, out, drawn or FORMATS[:1])
         else:
             files = write_report(
-                folder, out, tasks=task or (), reference=reference, thresholds=thresholds, command=command
+                folder,
+                out,
+                tasks=task or (),
+                reference=reference,
+                thresholds=thresholds,
+                command=command,
+                formats=drawn or FORMATS[:1],
             )
     typer.echo(f"{files[0]} and {len(files) - 1} figures in {files[0].with_suffix('')}")
 

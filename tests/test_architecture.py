@@ -16,7 +16,7 @@ MODULES = {
 }
 
 LAYERS = (
-    {"types", "errors", "autograd", "checks", "compiler", "extras", "forks", "randomness", "settings"},
+    {"types", "errors", "autograd", "checks", "compiler", "extras", "forks", "formats", "randomness", "settings"},
     {"envs", "wrappers"},
     {"data"},
     {"gp"},

@@ -9,8 +9,6 @@ import sys
 import pytest
 
 from gym_dgpmpc.checkpoints.format import read_checkpoint
-from gym_dgpmpc.cli.common import FigureFormat
-from gym_dgpmpc.runs.figures import FORMATS
 from gym_dgpmpc.runs.folder import read_rows
 from tests.command_line import SMALLEST, dgpmpc, is_one_line_error
 from tests.runs.toy import ENV_ID, ToyPush
@@ -43,10 +41,6 @@ def settings(folder):
 
 def write_settings(folder, content):
     (folder / "settings.json").write_text(json.dumps(content))
-
-
-def test_formats_are_those_that_are_drawn():
-    assert [each.value for each in FigureFormat] == list(FORMATS)
 
 
 # ------------------------------------------------------------------------------------------------------------- resume

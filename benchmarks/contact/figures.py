@@ -4,7 +4,6 @@ Drawn through Matplotlib's object interface alone, as `gym_dgpmpc/runs/figures.p
 """
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +16,7 @@ from benchmarks import paper
 from benchmarks.contact.data import find_case
 from benchmarks.contact.result_files import QUANTITIES, UNITS, ContactResult
 from benchmarks.contact.scores import LEVELS, coverage_name
-from gym_dgpmpc.runs.figures import write_figure
+from gym_dgpmpc.runs.figures import Paths, write_figure
 
 Setting = tuple[str, int]
 """Kernel and number of layers."""
@@ -34,7 +33,7 @@ KERNEL_COLOURS = dict(zip(KERNEL_NAMES, ("#0072B2", "#009E73", "#E69F00", "#D55E
 """Four of Okabe and Ito's palette, which colour-blind readers can tell apart."""
 
 
-def plot_fans(results: Mapping[Setting, ContactResult], path: Path) -> None:
+def plot_fans(results: Mapping[Setting, ContactResult], path: Paths) -> None:
     """The sampled change of the angular velocity from the mean start in blue, the true one in red.
 
     One row per kernel, one column per number of layers; all panels share their axes, which the truth and nine tenths
@@ -68,7 +67,7 @@ def plot_fans(results: Mapping[Setting, ContactResult], path: Path) -> None:
     write_figure(figure, path, dpi=130)
 
 
-def plot_scores_by_step(curves: Mapping[str, Mapping[Setting, Curve]], quantity: str, title: str, path: Path) -> None:
+def plot_scores_by_step(curves: Mapping[str, Mapping[Setting, Curve]], quantity: str, title: str, path: Paths) -> None:
     """Each score at each step of the test: mean over seeds and its interval.
 
     One row per score, one column per number of layers, one colour per kernel; of a coverage the wanted value is dotted.

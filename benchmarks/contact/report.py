@@ -21,6 +21,8 @@ from benchmarks.report.markdown import page_and_folder, table
 from benchmarks.report.provenance import SECTION, pairs
 from benchmarks.report.statistics import Estimate
 from gym_dgpmpc.checkpoints.files import replace_text
+from gym_dgpmpc.formats import FORMATS
+from gym_dgpmpc.runs.figures import files_of
 
 COMMAND = "dgpmpc bench contact"
 """What makes all runs of the study."""
@@ -35,12 +37,13 @@ Study = Mapping[Setting, BySeed]
 """The runs of one case."""
 
 
-def report_contact_study(folder: Path, out: Path) -> list[Path]:
+def report_contact_study(folder: Path, out: Path, formats: Sequence[str] = FORMATS[:1]) -> list[Path]:
     """Write the report ``out``.md, its figures into the folder ``out``, and return all files, the page first.
 
     Args:
         folder: of the study's results; not all of its runs need be there.
         out: with or without the suffix ".md".
+        formats: of the figures; the page shows the first.
 
     Raises:
         ResultError: a file is damaged, there are no files, or they belong to several studies.
@@ -51,14 +54,14 @@ def report_contact_study(folder: Path, out: Path) -> list[Path]:
     lines, written = _head(results), []
     for case in sorted({result.key.case for result in results}):
         study = _study(results, case)
-        fans, steps = figures / f"fans_{case}.png", figures / f"steps_{case}.png"
+        fans, steps = (files_of(figures, f"{name}_{case}", formats) for name in ("fans", "steps"))
         seed = min(seed for by_seed in study.values() for seed in by_seed)
         plot_fans({setting: by_seed[seed] for setting, by_seed in study.items() if seed in by_seed}, fans)
         curves = {score: {setting: _curve(by_seed, score) for setting, by_seed in study.items()} for score in SCORES}
         title = f"Case {case}: {CASES[case].title}; {QUANTITY} predicted open-loop"
         plot_scores_by_step(curves, QUANTITY, title, steps)
-        written += [fans, steps]
-        lines += _section(case, study, f"{figures.name}/{fans.name}", f"{figures.name}/{steps.name}")
+        written += [*fans, *steps]
+        lines += _section(case, study, f"{figures.name}/{fans[0].name}", f"{figures.name}/{steps[0].name}")
     replace_text(page, "\n".join([*lines, *_provenance(results)]) + "\n")
     return [page, *written]
 

@@ -1,7 +1,6 @@
 """The figures of a report, drawn through Matplotlib's object interface: no display, no change to pyplot's state."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +15,7 @@ from benchmarks.report import scores
 from benchmarks.report.curves import Clock, Curve, Earned, curve, line
 from benchmarks.report.scores import CEILING, Runs
 from benchmarks.report.styles import Style, styles
-from gym_dgpmpc.runs.figures import write_figure
+from gym_dgpmpc.runs.figures import Paths, write_figure
 
 CEILING_LABEL = "planner with the true dynamics"
 COLUMNS = 3
@@ -41,7 +40,7 @@ def plot_tasks(
     tasks: Mapping[str, Sequence[str]],
     study: Mapping[str, Runs],
     references: Mapping[str, str],
-    path: Path,
+    path: Paths,
     earned: Earned,
 ) -> None:
     """One panel per task, a curve per method against environment steps, with the ceiling.
@@ -50,7 +49,7 @@ def plot_tasks(
         tasks: the methods to draw, by task.
         study: the runs.
         references: the package's own method's setting, by task.
-        path: the picture to write.
+        path: the picture to write, or its files of several formats.
         earned: what is drawn.
     """
     columns = _columns(len(tasks))
@@ -65,7 +64,7 @@ def plot_tasks(
     write_figure(figure, path, dpi=DPI)
 
 
-def plot_clocks(methods: Sequence[str], task: str, runs: Runs, reference: str | None, path: Path) -> None:
+def plot_clocks(methods: Sequence[str], task: str, runs: Runs, reference: str | None, path: Paths) -> None:
     """One task: returns against environment steps and against wall-clock time."""
     figure, grid = _panels(2, 2)
     looks = _looks({task: methods}, {task: reference} if reference else {})
@@ -78,7 +77,7 @@ def plot_clocks(methods: Sequence[str], task: str, runs: Runs, reference: str | 
     write_figure(figure, path, dpi=DPI)
 
 
-def plot_settings(task: str, runs: Runs, path: Path) -> None:
+def plot_settings(task: str, runs: Runs, path: Paths) -> None:
     """One panel per kernel: every run of each depth thin, their mean thick, against environment steps."""
     settings = {scores.setting_of(method): results for method, results in runs.items()}
     kernels = [kernel for kernel in paper.KERNELS if any(setting and setting[0] == kernel for setting in settings)]
@@ -108,7 +107,7 @@ def plot_settings(task: str, runs: Runs, path: Path) -> None:
 
 
 def plot_variability(
-    tasks: Mapping[str, Sequence[str]], study: Mapping[str, Runs], references: Mapping[str, str], path: Path
+    tasks: Mapping[str, Sequence[str]], study: Mapping[str, Runs], references: Mapping[str, str], path: Paths
 ) -> None:
     """One panel per task, a row per method: each run's average over its first episodes, their mean and deviation."""
     looks = _looks(tasks, references)

@@ -14,6 +14,8 @@ from benchmarks.report.statistics import CONFIDENCE, RESAMPLES
 from benchmarks.result_files import ResultError
 from benchmarks.tasks import TASKS
 from gym_dgpmpc.checkpoints.files import replace_text
+from gym_dgpmpc.formats import FORMATS
+from gym_dgpmpc.runs.figures import files_of
 
 LEGEND = (
     f"Numbers in square brackets are {CONFIDENCE:.0%} percentile bootstrap intervals over seeds, stratified by task "
@@ -27,10 +29,11 @@ LEGEND = (
 class _Page:
     """Lines of Markdown, and the figures that they show."""
 
-    def __init__(self, folder: Path, origins: Origins) -> None:
+    def __init__(self, folder: Path, origins: Origins, formats: Sequence[str]) -> None:
         self.lines: list[str] = []
         self.figures: list[Path] = []
-        self._folder, self.origins = folder, origins
+        self._folder, self.origins, self._formats = folder, origins, formats
+        self._shown = folder
 
     def add(self, *lines: str) -> None:
         self.lines += [*lines, ""]
@@ -41,15 +44,16 @@ class _Page:
             self.add(*table)
             self.add(f"{caption} {self.origins.caption(study)}")
 
-    def place(self, name: str) -> Path:
-        """Where the next figure is to be written."""
-        path = self._folder / f"{re.sub(r'[^A-Za-z0-9.=_-]+', '-', name)}.png"
-        self.figures.append(path)
-        return path
+    def place(self, name: str) -> list[Path]:
+        """Where the next figure is to be written, the file that the page shows first."""
+        paths = files_of(self._folder, re.sub(r"[^A-Za-z0-9.=_-]+", "-", name), self._formats)
+        self.figures += paths
+        self._shown = paths[0]
+        return paths
 
     def show(self, what: str, study: Mapping[str, Runs], caption: str) -> None:
         """Refer to the figure that was written last."""
-        self.add(f"![{what}]({self._folder.name}/{self.figures[-1].name})")
+        self.add(f"![{what}]({self._folder.name}/{self._shown.name})")
         self.add(f"{caption} {self.origins.caption(study)}")
 
 
@@ -61,6 +65,7 @@ def write_report(
     reference: str | None = None,
     thresholds: Mapping[str, float] | None = None,
     command: str | None = None,
+    formats: Sequence[str] = FORMATS[:1],
 ) -> list[Path]:
     """Write ``out``.md, and the figures that it shows into the folder ``out``.
 
@@ -71,6 +76,7 @@ def write_report(
         reference: the method that stands for this package's own; otherwise its setting with the most runs.
         thresholds: returns that count as having learned, by task, instead of those that are known.
         command: that made the report, to be stated in it.
+        formats: of the figures; the page shows the first.
 
     Returns:
         The files, the page first.
@@ -86,7 +92,7 @@ def write_report(
         raise ValueError(f"a threshold is given for {', '.join(unknown)}, of which there are no runs")
     references = scores.reference_of(study, reference)
     page_file, figures = page_and_folder(out)
-    page = _Page(figures, Origins(study))
+    page = _Page(figures, Origins(study), formats)
     runs = sum(len(results) for of_task in study.values() for results in of_task.values())
     page.add("# Results")
     page.add(f"Made from {runs} result files in `{folder}`" + (f" by `{command}`." if command else "."))

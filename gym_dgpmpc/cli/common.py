@@ -5,7 +5,6 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from enum import Enum
 from pathlib import Path
 
 import gymnasium
@@ -15,14 +14,6 @@ from gym_dgpmpc.errors import DGPMPCError
 from gym_dgpmpc.extras import how_to_install, missing_module
 
 EXIT_ERROR, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 130, 143
-
-
-class FigureFormat(str, Enum):
-    """`runs.figures.FORMATS`, whose import takes too long for `--help`."""
-
-    PNG = "png"
-    PDF = "pdf"
-    SVG = "svg"
 
 
 @contextmanager

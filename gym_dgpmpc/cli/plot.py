@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from gym_dgpmpc.cli.common import FigureFormat, one_line_errors
+from gym_dgpmpc.cli.common import one_line_errors
+from gym_dgpmpc.formats import FORMATS, FigureFormat
 
 SEVERAL = "learning_curves"
 
@@ -33,7 +34,7 @@ def plot(
     with one_line_errors(ValueError, OSError):
         from gym_dgpmpc.runs.plotting import RecordedRun, draw_run, draw_runs, title_of
 
-        chosen = [each.value for each in formats or (FigureFormat.PNG,)]
+        chosen = [each.value for each in formats or ()] or FORMATS[:1]
         runs = [RecordedRun.read(folder) for folder in dict.fromkeys(folders)]
         if len(runs) == 1:
             written = draw_run(runs[0].path, title or title_of(runs[0].settings), chosen, out)

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gym_dgpmpc.cli.common import environment_of
+from gym_dgpmpc.formats import FORMATS
 from gym_dgpmpc.settings import refuse_unknown
 
 DEFAULT_EPISODES = 15
 DEFAULT_AGENT = "dgp-mpc"
-DEFAULT_OPTIONS: dict[str, Any] = {"threads": 1, "video": True, "checkpoint_every": None, "formats": ["png"]}
+DEFAULT_OPTIONS: dict[str, Any] = {"threads": 1, "video": True, "checkpoint_every": None, "formats": [*FORMATS[:1]]}
 """What is not given, and no folder says; beside ``episodes`` and ``timesteps``, of which one is needed."""
 
 

@@ -12,7 +12,6 @@ import typer
 from gym_dgpmpc.cli.common import (
     EXIT_INTERRUPTED,
     EXIT_TERMINATED,
-    FigureFormat,
     make,
     one_line_errors,
     prepare_video,
@@ -27,6 +26,7 @@ from gym_dgpmpc.cli.request import (
     new_request,
     resumed_request,
 )
+from gym_dgpmpc.formats import FigureFormat
 
 if TYPE_CHECKING:
     from gym_dgpmpc.runs.training import TrainingRun

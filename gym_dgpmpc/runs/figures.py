@@ -20,15 +20,13 @@ from matplotlib.ticker import MaxNLocator
 from numpy import ndarray
 
 from gym_dgpmpc.checkpoints.files import replace_file
+from gym_dgpmpc.formats import FORMATS
 
 MODEL_COLOUR, TRUTH_COLOUR, RANDOM_COLOUR = "tab:blue", "black", "tab:gray"
 BANDS = {0.9: 0.2, 0.5: 0.35}
 """The bands of a fan, widest first: probability inside -> opacity."""
 
 WIDEST = max(BANDS)
-
-FORMATS = ("png", "pdf", "svg")
-"""What figures are drawn in, the first where nothing else is asked for."""
 
 Paths = str | Path | Sequence[Path]
 """A file, or the same figure's files of several formats; the suffix decides which."""
@@ -174,6 +172,11 @@ def write_figure(figure: Figure, path: Paths, *, dpi: int) -> None:
                 figure.savefig(file, format=kind, dpi=dpi, metadata=NO_DATES.get(kind))
 
         replace_file(each, save)
+
+
+def files_of(folder: Path, name: str, formats: Sequence[str]) -> list[Path]:
+    """The files of one figure in several formats."""
+    return [folder / f"{name}.{each}" for each in formats]
 
 
 def observation_labels(env_class: type, size: int) -> list[str]:

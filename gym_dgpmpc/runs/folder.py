@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from gym_dgpmpc.checkpoints.files import replace_text
 from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.errors import DGPMPCError
-from gym_dgpmpc.runs.figures import FORMATS
+from gym_dgpmpc.formats import FORMATS
 from gym_dgpmpc.runs.provenance import machine, revision, versions
 
 SETTINGS_FILE, EPISODES_FILE, LOGS = "settings.json", "episodes.csv", "tensorboard"

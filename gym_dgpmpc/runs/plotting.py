@@ -13,11 +13,12 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from numpy import ndarray
 
+from gym_dgpmpc.formats import FORMATS
 from gym_dgpmpc.runs.figures import (
-    FORMATS,
     RANDOM_COLOUR,
     RETURN,
     Paths,
+    files_of,
     plot_learning_curve,
     plot_prediction_fan,
     write_figure,
@@ -98,7 +99,7 @@ def draw_run(folder: Path, title: str, formats: Sequence[str] = FORMATS[:1], out
     out, written = out or folder, []
     rows = read_rows(folder / EPISODES_FILE)
     if rows:
-        written += (files := _files(out, LEARNING_CURVE, formats))
+        written += (files := files_of(out, LEARNING_CURVE, formats))
         plot_learning_curve(
             [row.episode_return for row in rows],
             files,
@@ -108,7 +109,7 @@ def draw_run(folder: Path, title: str, formats: Sequence[str] = FORMATS[:1], out
         )
     if (folder / FORECASTS).is_file():
         kept = KeptForecasts.read(folder / FORECASTS)
-        written += (files := _files(out, PREDICTION_FAN, formats))
+        written += (files := files_of(out, PREDICTION_FAN, formats))
         plot_prediction_fan(
             kept.forecasts,
             files,
@@ -117,10 +118,6 @@ def draw_run(folder: Path, title: str, formats: Sequence[str] = FORMATS[:1], out
             step_seconds=kept.step_seconds,
         )
     return written
-
-
-def _files(folder: Path, name: str, formats: Sequence[str]) -> list[Path]:
-    return [folder / f"{name}.{each}" for each in formats]
 
 
 def draw_runs(
@@ -141,7 +138,7 @@ def draw_runs(
     environments = sorted({str(run.settings.get("environment")) for run in runs})
     if len(environments) > 1:
         raise ValueError(f"returns of different tasks do not compare: draw {' and '.join(environments)} one at a time")
-    methods, files = by_method(runs), _files(name.parent, name.name, formats)
+    methods, files = by_method(runs), files_of(name.parent, name.name, formats)
     models = {model_of(run.settings) for run in runs}
     known = f"{environments[0]}, {models.pop()}" if len(models) == 1 else environments[0]
     plot_learning_curves(methods, files, title=title or known)

@@ -12,7 +12,8 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from gym_dgpmpc.agents import MPCAgent
 from gym_dgpmpc.checkpoints.safeguard import resume_from
-from gym_dgpmpc.runs.figures import FORMATS, observation_labels
+from gym_dgpmpc.formats import FORMATS
+from gym_dgpmpc.runs.figures import observation_labels
 from gym_dgpmpc.runs.folder import FORECASTS, LAST_EPISODE, LOGS, EpisodeRow, RunFolder
 from gym_dgpmpc.runs.forecasts import KeptForecasts
 from gym_dgpmpc.runs.plotting import draw_run

@@ -6,7 +6,8 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from gym_dgpmpc.runs.figures import FORMATS, Forecast
+from gym_dgpmpc.formats import FORMATS
+from gym_dgpmpc.runs.figures import Forecast
 from gym_dgpmpc.runs.folder import EpisodeRow, RunFolder, RunFolderError
 from gym_dgpmpc.runs.forecasts import KeptForecasts
 from gym_dgpmpc.runs.plotting import (

@@ -132,5 +132,9 @@ def test_curves_by_step_are_of_the_seeds_of_a_setting(drawn, tmp_path):
 
 def test_a_report_can_be_made_of_what_there_is(tmp_path):
     made_up(ContactKey("c", "matern32", 3, 5), 1.0).write(tmp_path)
-    text = report_contact_study(tmp_path, tmp_path / "out")[0].read_text()
+    page, *figures = report_contact_study(tmp_path, tmp_path / "out", ["svg", "png"])
+    text = page.read_text()
     assert "| Matérn-3/2 | 3 | 1 | 1.000 | 1.000 |" in text
+    assert "(out/fans_c.svg)" in text
+    assert [path.name for path in figures] == ["fans_c.svg", "fans_c.png", "steps_c.svg", "steps_c.png"]
+    assert all(path.stat().st_size > 0 for path in figures)

@@ -236,6 +236,16 @@ def test_command(command, folder, tmp_path):
     assert "first reached −2.50 (as given)" in page
 
 
+def test_figures_in_other_formats_lie_beside_those_of_the_page(command, folder, tmp_path):
+    out = tmp_path / "out"
+    result = command(folder, "--out", out, "--task", "Alone-v0", "--format", "png", "--format", "svg")
+    assert result.exit_code == 0, result.output
+    page = out.with_suffix(".md").read_text()
+    assert re.findall(r"!\[[^\]]+\]\(([^)]+)\)", page) == ["out/Alone-v0_learning.png"]
+    assert f"--out {out} --task Alone-v0 --format png --format svg`" in page
+    assert sorted(path.name for path in out.iterdir()) == ["Alone-v0_learning.png", "Alone-v0_learning.svg"]
+
+
 @pytest.mark.parametrize("text", ["Fetch-v4", "=1", "Fetch-v4=much", "Fetch-v4=nan"])
 def test_command_with_half_a_threshold(command, folder, text):
     result = command(folder, "--threshold", text)
