@@ -9,6 +9,7 @@ import time
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -34,6 +35,7 @@ from benchmarks.contact.scores import scores
 from benchmarks.jobs import Folders
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.envs.mod_cartpole import ModCartPoleEnv
+from gym_dgpmpc.gp.kernels import KernelName
 from gym_dgpmpc.runs.provenance import machine, revision, versions
 from gym_dgpmpc.types import DynamicsModel
 
@@ -139,7 +141,7 @@ def _model(key: ContactKey, settings: ContactSettings) -> DeepGPDynamics:
         1,
         ModCartPoleEnv().observation_spec,
         num_layers=key.num_layers,
-        kernel=key.kernel,
+        kernel=cast(KernelName, key.kernel),
         num_inducing=settings.num_inducing,
         # The paper's law: candidates of one plan are drawn jointly, but each start of a test stands for itself.
         draw="marginal",

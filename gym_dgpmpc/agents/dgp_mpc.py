@@ -3,11 +3,18 @@
 Gadd et al. (2020), "Sample-Efficient Reinforcement Learning using Deep Gaussian Processes".
 """
 
+from typing import TYPE_CHECKING
+
 from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
 
+if TYPE_CHECKING:
+    from gym_dgpmpc.agents.typed import DGPMPCAgentBase  # MPCAgent with every argument, see `typed.pyi`
+else:
+    DGPMPCAgentBase = MPCAgent
 
-class DGPMPCAgent(MPCAgent):
+
+class DGPMPCAgent(DGPMPCAgentBase):
     """The paper's agent, an `MPCAgent` made of a `DeepGPDynamics` and, by default, a `CEM`.
 
         agent = DGPMPCAgent("ModCartPole-v0", seed=0, verbose=1)

@@ -6,14 +6,20 @@ process's worlds are functions, drawn anew for each imagined episode, and last f
 """
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from gym_dgpmpc.agents.dgp_mpc import DGPMPCAgent
 from gym_dgpmpc.checkpoints.interface import StateOf
 from gym_dgpmpc.imagination.controller import PolicyController, improvement_seed
 from gym_dgpmpc.types import StateDict, Stateful
 
+if TYPE_CHECKING:
+    from gym_dgpmpc.agents.typed import DynaAgentBase  # DGPMPCAgent with every argument, see `typed.pyi`
+else:
+    DynaAgentBase = DGPMPCAgent
 
-class DynaAgent(DGPMPCAgent):
+
+class DynaAgent(DynaAgentBase):
     """Learns a deep Gaussian process as `DGPMPCAgent` does, and acts by a policy that lives in its worlds.
 
         agent = DynaAgent("ModCartPole-v0", seed=0, verbose=1)

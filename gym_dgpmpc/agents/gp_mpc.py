@@ -3,13 +3,20 @@
 The Gaussian-process baselines of Chua et al. (2018) and of Gadd et al. (2020): GP-DS and GP-MM.
 """
 
+from typing import TYPE_CHECKING
+
 from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.dynamics.sparse_gp import SparseGPDynamics
 from gym_dgpmpc.tasks.environment import flat_size
 from gym_dgpmpc.types import DynamicsModel, ObservationSpec
 
+if TYPE_CHECKING:
+    from gym_dgpmpc.agents.typed import GPMPCAgentBase  # MPCAgent with every argument, see `typed.pyi`
+else:
+    GPMPCAgentBase = MPCAgent
 
-class GPMPCAgent(MPCAgent):
+
+class GPMPCAgent(GPMPCAgentBase):
     """The comparison's Gaussian process: an `MPCAgent` made of a `SparseGPDynamics` and, by default, a `CEM`.
 
         agent = GPMPCAgent("ModCartPole-v0", **COMPARISON_GP["ModCartPole-v0"], draw="MM", seed=0, verbose=1)

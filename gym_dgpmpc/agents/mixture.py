@@ -3,11 +3,18 @@
 Gadd et al. (2020) name the combination of Gaussian processes and neural networks as future work.
 """
 
+from typing import TYPE_CHECKING
+
 from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.dynamics.mixture import MixtureDynamics
 
+if TYPE_CHECKING:
+    from gym_dgpmpc.agents.typed import MixtureMPCAgentBase  # MPCAgent with every argument, see `typed.pyi`
+else:
+    MixtureMPCAgentBase = MPCAgent
 
-class MixtureMPCAgent(MPCAgent):
+
+class MixtureMPCAgent(MixtureMPCAgentBase):
     """An `MPCAgent` made of a `MixtureDynamics` and, by default, a `CEM`.
 
         agent = MixtureMPCAgent("ModCartPole-v0", **mixture_settings_for("ModCartPole-v0"), seed=0, verbose=1)

@@ -4,13 +4,18 @@ Chua et al. (2018), "Deep Reinforcement Learning in a Handful of Trials using Pr
 """
 
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.dynamics.ensemble import EnsembleDynamics
 
+if TYPE_CHECKING:
+    from gym_dgpmpc.agents.typed import PETSAgentBase  # MPCAgent with every argument, see `typed.pyi`
+else:
+    PETSAgentBase = MPCAgent
 
-class PETSAgent(MPCAgent):
+
+class PETSAgent(PETSAgentBase):
     """PETS, an `MPCAgent` made of an `EnsembleDynamics` and, by default, a `CEM`.
 
         agent = PETSAgent("SwingUpCartPole-v0", **PETS["SwingUpCartPole-v0"], seed=0, verbose=1)
@@ -29,5 +34,7 @@ class PETSAgent(MPCAgent):
     dynamics_class = EnsembleDynamics
     planner_defaults = MappingProxyType({"horizon": 25, "num_candidates": 400})
 
-    def __init__(self, *args: Any, num_particles: int = 20, **settings: Any):
-        super().__init__(*args, num_particles=num_particles, **settings)
+    if not TYPE_CHECKING:  # to whom the base says all of it
+
+        def __init__(self, *args: Any, num_particles: int = 20, **settings: Any):
+            super().__init__(*args, num_particles=num_particles, **settings)

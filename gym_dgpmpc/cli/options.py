@@ -18,8 +18,6 @@ from gym_dgpmpc.agents import DGPMPCAgent, DynaAgent, MixtureMPCAgent, MPCAgent,
 from gym_dgpmpc.agents.composition import model_settings
 from gym_dgpmpc.cli.request import DEFAULT_AGENT
 from gym_dgpmpc.cli.train import RUN
-from gym_dgpmpc.dynamics.mixture.model import MEMBERS
-from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.planning.registry import PLANNERS, planner_factory
 from gym_dgpmpc.settings import Setting, settings_of
 from gym_dgpmpc.tasks.functions import LEARNED, NEVER
@@ -51,10 +49,6 @@ SOURCE_TEXTS = {
     "reward_fn": "Let the model learn the reward, even where it is known.",
     "terminated_fn": "Let the model learn when an episode ends, even where it is known; or plan as if none did.",
 }
-CHOICES = {of_kernel: tuple(KERNELS) for of_kernel in ("kernel", "deep_gp_kernel", "sparse_gp_kernel")}
-"""The values of settings whose annotation does not list them."""
-SEVERAL = {"members": tuple(MEMBERS)}
-"""Those of settings that are several of them; such an option is given once for each."""
 
 
 def agent_asked_for(args: Sequence[str]) -> str:
@@ -131,17 +125,15 @@ def _option(
 
 
 def _option_type(setting: Setting) -> Any:
-    """The type of an option, or None if the setting is not a plain value."""
-    if setting.name in SEVERAL:
-        return list[_choice(setting.name, SEVERAL[setting.name])]  # type: ignore[misc]
-    if setting.name in CHOICES:
-        return _choice(setting.name, CHOICES[setting.name])
+    """The type of an option, or None if the setting is not a plain value; one of several is given once for each."""
     annotation = setting.annotation
     if get_origin(annotation) in (Union, types.UnionType):
         kinds = [each for each in get_args(annotation) if each is not type(None)]
         annotation = kinds[0] if len(kinds) == 1 else None
     if get_origin(annotation) is Literal:
         return _choice(setting.name, get_args(annotation))
+    if get_origin(annotation) is Sequence and get_origin(get_args(annotation)[0]) is Literal:
+        return list[_choice(setting.name, get_args(get_args(annotation)[0]))]  # type: ignore[misc]
     return annotation if annotation in (int, float, bool, str) else None
 
 

@@ -7,7 +7,7 @@ and an entry there. Rollouts and training are several times faster if `dynamics/
 """
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -207,6 +207,9 @@ class Matern72(Matern):
 
 KERNELS: dict[str, Kernel] = {kernel.name: kernel for kernel in (RBF(), Matern72(), Matern52(), Matern32(), Matern12())}
 """Every kernel by its name, from the smoothest functions to the roughest. You may add your own."""
+
+KernelName = Literal["rbf", "matern72", "matern52", "matern32", "matern12"]
+"""Those that come with the package: what type checkers and the command line know."""
 
 
 def find_kernel(kernel: str | Kernel) -> Kernel:

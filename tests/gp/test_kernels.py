@@ -1,12 +1,13 @@
 """Kernels against their definitions, and their hand-written derivative against finite differences."""
 
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch
 
-from gym_dgpmpc.gp.kernels import KERNELS, find_kernel, pairwise_sqdist, scaled_sqdist
+from gym_dgpmpc.gp.kernels import KERNELS, KernelName, find_kernel, pairwise_sqdist, scaled_sqdist
 from tests.oracles import gaussian_process
 from tests.oracles.gaussian_process import MATERN_ORDER
 from tests.oracles.models import normal, seeded
@@ -115,3 +116,7 @@ def test_an_unknown_kernel_is_named_with_the_known_ones(kernel):
     with pytest.raises(ValueError) as error:
         find_kernel(kernel)
     assert all(name in str(error.value) for name in (repr(kernel), *KERNELS))
+
+
+def test_type_checkers_and_the_command_line_know_every_kernel():
+    assert get_args(KernelName) == tuple(KERNELS)

@@ -37,7 +37,7 @@ from gym_dgpmpc.dynamics.noise import observed
 from gym_dgpmpc.dynamics.predictive import Mixture
 from gym_dgpmpc.errors import FactorisationError
 from gym_dgpmpc.gp.deep_gp import Factorised, factorise_all, posterior_mean, propagate
-from gym_dgpmpc.gp.kernels import Kernel, find_kernel
+from gym_dgpmpc.gp.kernels import Kernel, KernelName, find_kernel
 from gym_dgpmpc.inference import sghmc, training
 from gym_dgpmpc.inference.following import Follower
 from gym_dgpmpc.inference.settings import InferenceSettings
@@ -125,7 +125,7 @@ class DeepGPDynamics(Learner[Fitted]):
         observation_spec: ObservationSpec | None = None,
         *,
         num_layers: int = 2,
-        kernel: str = "matern32",
+        kernel: KernelName = "matern32",
         linear: bool = False,
         num_inducing: int = 100,
         draw: Draw = "pathwise",

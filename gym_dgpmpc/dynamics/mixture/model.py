@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -35,6 +35,7 @@ from gym_dgpmpc.types import (
 
 Member = DeepGPDynamics | SparseGPDynamics | EnsembleDynamics
 
+MemberName = Literal["deep-gp", "sparse-gp", "ensemble"]
 MEMBERS: Mapping[str, Callable[..., Member]] = MappingProxyType(
     {
         "deep-gp": DeepGPDynamics,
@@ -95,7 +96,7 @@ class MixtureDynamics(Learner[_Fitted]):
         action_size: int,
         observation_spec: ObservationSpec | None = None,
         *,
-        members: Sequence[str] = ("deep-gp", "ensemble"),
+        members: Sequence[MemberName] = ("deep-gp", "ensemble"),
         score_every: int = 5,
         evidence_share: float = 0.5,
         dtype: torch.dtype = torch.float32,
@@ -115,7 +116,7 @@ class MixtureDynamics(Learner[_Fitted]):
         super().__init__(observation_size, action_size, observation_spec, dtype, device)
         self.score_every, self.evidence_share = score_every, evidence_share
         shape = observation_size, action_size, observation_spec
-        self._make = {
+        self._make: dict[str, Callable[[], Member]] = {
             name: partial(
                 MEMBERS[name],
                 *shape,

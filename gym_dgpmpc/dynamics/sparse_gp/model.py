@@ -26,7 +26,7 @@ from gym_dgpmpc.dynamics.predictive import Mixture
 from gym_dgpmpc.dynamics.sparse_gp.moment_matching import MomentMatchingSampler
 from gym_dgpmpc.dynamics.state import normalisers_state, take_normaliser, take_tensor, take_tensors
 from gym_dgpmpc.gp.deep_gp import DeepGP
-from gym_dgpmpc.gp.kernels import RBF, Kernel, find_kernel
+from gym_dgpmpc.gp.kernels import RBF, Kernel, KernelName, find_kernel
 from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.gp.moments import Predictor
 from gym_dgpmpc.gp.sgpr import SparsePosterior, shrinkage, sparse_posterior, sparse_predict
@@ -87,7 +87,7 @@ class SparseGPDynamics(Learner[_Fitted]):
         action_size: int,
         observation_spec: ObservationSpec | None = None,
         *,
-        kernel: str = "rbf",
+        kernel: KernelName = "rbf",
         num_inducing: int = 200,
         exact: bool = False,
         max_training_iterations: int = 200,

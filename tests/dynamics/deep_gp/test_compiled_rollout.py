@@ -245,7 +245,7 @@ class Own(RBF):
     name = "own"
 
 
-def test_a_kernel_that_the_compiled_code_does_not_have_is_left_to_pytorch(monkeypatch):
+def test_a_kernel_that_the_compiled_code_does_not_have_is_left_to_pytorch(monkeypatch, unchecked):
     """With one warning from training and one from plans; none where none is wanted. The plans are the same."""
     monkeypatch.setitem(KERNELS, "own", Own())
     compiler.warn_once.cache_clear()
@@ -273,7 +273,7 @@ def test_a_kernel_that_the_compiled_code_does_not_have_is_left_to_pytorch(monkey
     assert all(torch.equal(states[0], other) for other in states[1:])
 
 
-def test_a_compiled_world_of_an_unknown_kernel_is_an_error(monkeypatch):
+def test_a_compiled_world_of_an_unknown_kernel_is_an_error(monkeypatch, unchecked):
     monkeypatch.setitem(KERNELS, "own", Own())
     with pytest.raises(RuntimeError, match="kernel 'own'"):
         Draw("own", 1)

@@ -169,7 +169,7 @@ def test_members_are_made_with_their_own_settings():
         ({"ensemble_num_epochs": 0}, ValueError, "num_epochs.*0"),
     ],
 )
-def test_settings_out_of_range_are_named(settings, error, value):
+def test_settings_out_of_range_are_named(unchecked, settings, error, value):
     with pytest.raises(error, match=value):
         mixture(**settings)
 
