@@ -71,7 +71,7 @@ class DGPMPCAgentBase(MPCAgent):
         tensorboard_log: str | PathLike[str] | None = None,
         verbose: int = 0,
         seed: int | None = None,
-        planner: Literal["cem", "icem", "mppi"] | str | Callable[..., Planner] | Planner | None = "cem",
+        planner: Literal["cem", "icem", "mppi", "gradient"] | str | Callable[..., Planner] | Planner | None = "cem",
         reward_fn: RewardFn | Literal["learned"] | None = None,
         terminated_fn: TerminatedFn | Literal["learned"] | Literal["never"] | None = None,
         first_controller: Callable[[Any], Any] | None = None,
@@ -84,6 +84,11 @@ class DGPMPCAgentBase(MPCAgent):
         standardise: bool = True,
         noise_std: float = 0.25,
         control_cost: float = 0.0,
+        optimiser: Literal["adam", "lbfgs"] = "lbfgs",
+        action_step: float = 0.1,
+        start_from: Literal["plan", "cem"] = "plan",
+        cem_candidates: int = 100,
+        cem_iterations: int = 3,
     ) -> None: ...
     @property
     def num_layers(self) -> int: ...
@@ -189,12 +194,15 @@ class DynaAgentBase(DGPMPCAgent):
         gibbs_rows: int = 4096,
         patience: int | None = None,
         look_every: int = 100,
-        algorithm: Literal["SAC", "TD3", "DDPG", "PPO", "A2C", "TQC", "CrossQ"] = "SAC",
+        algorithm: Literal["gradient", "SAC", "TD3", "DDPG", "PPO", "A2C", "TQC", "CrossQ"] = "SAC",
         acts_by: Literal["policy", "planner"] = "policy",
-        imagined_timesteps: int = 20000,
+        imagined_timesteps: int | None = None,
         num_worlds: int = 20,
-        trial_every: int = 2000,
-        trial_patience: int = 5,
+        trial_every: int | None = None,
+        trial_patience: int = 8,
+        proposes: bool = False,
+        terminal_value: bool = False,
+        value_depths: int = 1,
         horizon: int = 30,
         num_candidates: int = 300,
         num_elites: int | None = None,
@@ -217,7 +225,7 @@ class DynaAgentBase(DGPMPCAgent):
         tensorboard_log: str | PathLike[str] | None = None,
         verbose: int = 0,
         seed: int | None = None,
-        planner: Literal["cem", "icem", "mppi"] | str | Callable[..., Planner] | Planner | None = "cem",
+        planner: Literal["cem", "icem", "mppi", "gradient"] | str | Callable[..., Planner] | Planner | None = "cem",
         reward_fn: RewardFn | Literal["learned"] | None = None,
         terminated_fn: TerminatedFn | Literal["learned"] | Literal["never"] | None = None,
         first_controller: Callable[[Any], Any] | None = None,
@@ -230,6 +238,11 @@ class DynaAgentBase(DGPMPCAgent):
         standardise: bool = True,
         noise_std: float = 0.25,
         control_cost: float = 0.0,
+        optimiser: Literal["adam", "lbfgs"] = "lbfgs",
+        action_step: float = 0.1,
+        start_from: Literal["plan", "cem"] = "plan",
+        cem_candidates: int = 100,
+        cem_iterations: int = 3,
     ) -> None: ...
     @property
     def num_layers(self) -> int: ...
@@ -288,17 +301,23 @@ class DynaAgentBase(DGPMPCAgent):
     @property
     def look_every(self) -> int: ...
     @property
-    def algorithm(self) -> Literal["SAC", "TD3", "DDPG", "PPO", "A2C", "TQC", "CrossQ"]: ...
+    def algorithm(self) -> Literal["gradient", "SAC", "TD3", "DDPG", "PPO", "A2C", "TQC", "CrossQ"]: ...
     @property
     def acts_by(self) -> Literal["policy", "planner"]: ...
     @property
-    def imagined_timesteps(self) -> int: ...
+    def imagined_timesteps(self) -> int | None: ...
     @property
     def num_worlds(self) -> int: ...
     @property
-    def trial_every(self) -> int: ...
+    def trial_every(self) -> int | None: ...
     @property
     def trial_patience(self) -> int: ...
+    @property
+    def proposes(self) -> bool: ...
+    @property
+    def terminal_value(self) -> bool: ...
+    @property
+    def value_depths(self) -> int: ...
     @property
     def horizon(self) -> int: ...
     @property
@@ -348,7 +367,7 @@ class GPMPCAgentBase(MPCAgent):
         tensorboard_log: str | PathLike[str] | None = None,
         verbose: int = 0,
         seed: int | None = None,
-        planner: Literal["cem", "icem", "mppi"] | str | Callable[..., Planner] | Planner | None = "cem",
+        planner: Literal["cem", "icem", "mppi", "gradient"] | str | Callable[..., Planner] | Planner | None = "cem",
         reward_fn: RewardFn | Literal["learned"] | None = None,
         terminated_fn: TerminatedFn | Literal["learned"] | Literal["never"] | None = None,
         first_controller: Callable[[Any], Any] | None = None,
@@ -361,6 +380,11 @@ class GPMPCAgentBase(MPCAgent):
         standardise: bool = True,
         noise_std: float = 0.25,
         control_cost: float = 0.0,
+        optimiser: Literal["adam", "lbfgs"] = "lbfgs",
+        action_step: float = 0.1,
+        start_from: Literal["plan", "cem"] = "plan",
+        cem_candidates: int = 100,
+        cem_iterations: int = 3,
     ) -> None: ...
     @property
     def kernel(self) -> Literal["rbf", "matern72", "matern52", "matern32", "matern12"]: ...
@@ -471,7 +495,7 @@ class MixtureMPCAgentBase(MPCAgent):
         tensorboard_log: str | PathLike[str] | None = None,
         verbose: int = 0,
         seed: int | None = None,
-        planner: Literal["cem", "icem", "mppi"] | str | Callable[..., Planner] | Planner | None = "cem",
+        planner: Literal["cem", "icem", "mppi", "gradient"] | str | Callable[..., Planner] | Planner | None = "cem",
         reward_fn: RewardFn | Literal["learned"] | None = None,
         terminated_fn: TerminatedFn | Literal["learned"] | Literal["never"] | None = None,
         first_controller: Callable[[Any], Any] | None = None,
@@ -484,6 +508,11 @@ class MixtureMPCAgentBase(MPCAgent):
         standardise: bool = True,
         noise_std: float = 0.25,
         control_cost: float = 0.0,
+        optimiser: Literal["adam", "lbfgs"] = "lbfgs",
+        action_step: float = 0.1,
+        start_from: Literal["plan", "cem"] = "plan",
+        cem_candidates: int = 100,
+        cem_iterations: int = 3,
     ) -> None: ...
     @property
     def members(self) -> Sequence[Literal["deep-gp", "sparse-gp", "ensemble"]]: ...
@@ -642,7 +671,7 @@ class PETSAgentBase(MPCAgent):
         tensorboard_log: str | PathLike[str] | None = None,
         verbose: int = 0,
         seed: int | None = None,
-        planner: Literal["cem", "icem", "mppi"] | str | Callable[..., Planner] | Planner | None = "cem",
+        planner: Literal["cem", "icem", "mppi", "gradient"] | str | Callable[..., Planner] | Planner | None = "cem",
         reward_fn: RewardFn | Literal["learned"] | None = None,
         terminated_fn: TerminatedFn | Literal["learned"] | Literal["never"] | None = None,
         first_controller: Callable[[Any], Any] | None = None,
@@ -655,6 +684,11 @@ class PETSAgentBase(MPCAgent):
         standardise: bool = True,
         noise_std: float = 0.25,
         control_cost: float = 0.0,
+        optimiser: Literal["adam", "lbfgs"] = "lbfgs",
+        action_step: float = 0.1,
+        start_from: Literal["plan", "cem"] = "plan",
+        cem_candidates: int = 100,
+        cem_iterations: int = 3,
     ) -> None: ...
     @property
     def num_members(self) -> int: ...
