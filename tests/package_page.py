@@ -1,4 +1,4 @@
-"""Writes `docs/package_page.md`, what a package index shows: README.md, whose relative links lead nowhere there.
+"""Writes `PACKAGE.md`, what a package index shows: README.md, whose relative links lead nowhere there.
 
 They become absolute if `[project.urls]` of pyproject.toml names the `Repository`; without an address they become plain
 text, and a picture says what it shows.
@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 CLONE = Path(__file__).parents[1]
-PAGE = CLONE / "docs" / "package_page.md"
+PAGE = CLONE / "PACKAGE.md"
 
 
 def repository(project: str) -> str | None:
