@@ -8,7 +8,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 
-from benchmarks.methods import METHODS
+from benchmarks.methods import METHODS, dgp_mpc
 from benchmarks.paper import EPISODES as PAPER_TASKS
 from benchmarks.paper import KERNELS
 from benchmarks.suites import AT_THEIR_BEST, SUITES, Selection, SuiteError, find_suite
