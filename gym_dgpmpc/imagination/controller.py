@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.errors import PlanningError
-from gym_dgpmpc.imagination.algorithms import AlgorithmName, algorithm_class, suited_settings
+from gym_dgpmpc.imagination.algorithms import AlgorithmName, algorithm_class, budget_of, suited_settings
 from gym_dgpmpc.imagination.features import encoding
 from gym_dgpmpc.imagination.global_randomness import lent_randomness
 from gym_dgpmpc.imagination.policies import imagine, learned_parameters, take_over
@@ -43,7 +43,7 @@ class PolicyController(Controller):
             "gradient", which climbs the return through the worlds' derivatives.
         acts_by: "policy", or "planner": then the policy is learned all the same, for when the run is over.
         imagined_timesteps: imagined steps from which the policy learns after each training of the model, at most;
-            default: what suits the algorithm.
+            default: a third of what suits the algorithm from the start.
         num_worlds: worlds side by side in which it learns.
         trial_every: imagined steps between two trials in worlds that it never learns in; default: as before.
         trial_patience: trials without a better one after which it stops learning until the next training.
@@ -108,7 +108,7 @@ class PolicyController(Controller):
         imagined = imagine(
             agent,
             self._kind,
-            self.imagined_timesteps,
+            self.imagined_timesteps or budget_of(self._kind).total_timesteps // 3,
             num_worlds=self.num_worlds,
             trial_every=self.trial_every,
             patience=self.trial_patience,
