@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import get_args
 
 import gymnasium
+import numpy as np
 import pytest
+from stable_baselines3 import SAC
 from typer.testing import CliRunner
 
 from gym_dgpmpc import cli
@@ -25,6 +27,7 @@ from gym_dgpmpc.cli import options
 from gym_dgpmpc.cli.request import fill_in
 from gym_dgpmpc.dynamics.deep_gp.draws import DRAWS, REFRESHES
 from gym_dgpmpc.gp.kernels import KERNELS
+from gym_dgpmpc.imagination.export import run_exported
 from gym_dgpmpc.planning import PLANNERS, register_planner
 from gym_dgpmpc.planning.registry import PlannerName
 from gym_dgpmpc.planning.risk import RiskName
@@ -290,6 +293,25 @@ def test_limits_of_options(run, option, name):
     result = run("train", ENV_ID, option, "--no-video")
     assert result.exit_code == 2
     assert name in result.stderr
+
+
+def test_a_policy_is_distilled_from_a_run(run, tmp_path):
+    assert run("train", ENV_ID, *SMALLEST, "--episodes", 1, "--no-video", "--out", "a").exit_code == 0
+    few = ("--timesteps", 40, "--trial-every", 20, "--worlds", 2)
+    result = run("distil", "a", *few, "--export", "a/policy.pt", "--episodes", 1)
+    assert result.exit_code == 0, result.output
+    assert len(re.findall(r"^ +\d+ imagined steps \| return in held-out worlds", result.stdout, re.MULTILINE)) == 2
+    assert (
+        "return in fresh worlds" in result.stdout and "in the environment: mean return of 1 episodes" in result.stdout
+    )
+    model = SAC.load(tmp_path / "a/policy.zip", device="cpu")
+    observation = np.zeros(model.observation_space.shape, np.float32)
+    acted = run_exported(tmp_path / "a/policy.pt", observation[None])
+    np.testing.assert_allclose(acted[0], model.predict(observation, deterministic=True)[0], atol=1e-5)
+    # What is wrong is said before anything is trained.
+    assert is_one_line_error(run("distil", "a", *few, "--export", "policy.h5"), ".pt or .onnx", "policy.h5")
+    assert is_one_line_error(run("distil", "a", *few, "--algorithm", "DQN"), "algorithm must be one of", "DQN")
+    assert is_one_line_error(run("distil", "b"), "no file b")
 
 
 def test_evaluate_says_what_is_wrong(run, tmp_path):
