@@ -9,6 +9,7 @@ import inspect
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import Enum
+from functools import cache
 from itertools import pairwise
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
@@ -149,9 +150,14 @@ def _default_text(setting: Setting) -> str | bool:
 
 def _or_the_presets(name: str, texts: list[str]) -> str:
     """A default with a word of presets, if any task has one for this setting."""
+    return " or ".join([*texts, *(["the preset's for ENV_ID"] if name in _of_presets() else [])])
+
+
+@cache
+def _of_presets() -> set[str]:
+    """Names of settings that the preset of some task has."""
     env_ids = {env_id for table in (*presets.OF_A_TASK, presets.NETWORKS) for env_id in table}
-    is_preset = any(name in each.settings_for(env_id) for each in AGENTS.values() for env_id in env_ids)
-    return " or ".join([*texts, *(["the preset's for ENV_ID"] if is_preset else [])])
+    return {name for each in AGENTS.values() for env_id in env_ids for name in each.settings_for(env_id)}
 
 
 def _plain_value(value: Any) -> Any:

@@ -125,7 +125,7 @@ def test_an_observation_spec_with_vectors_survives_a_file(tmp_path):
         ({"observation_spec": ObservationSpec(angles=(7,))}, r"angles.*\(7,\)"),
     ],
 )
-def test_settings_out_of_range_are_named(arguments, message):
+def test_settings_out_of_range_are_named(arguments, message, unchecked):
     with pytest.raises(ValueError, match=message):
         tiny(**arguments)
 

@@ -21,6 +21,14 @@ DEEP_GP = {
 }  # fmt: skip
 PETS = {**PLANNING, "num_members": 2, "num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-4)}
 GP = {**PLANNING, "num_inducing": 12, "max_training_iterations": 10}
+
+
+def climbing(settings, optimiser):
+    """By gradients, from as many sequences as others are sampled."""
+    others = {name: value for name, value in settings.items() if name != "num_candidates"}
+    return {**others, "planner": "gradient", "num_starts": settings["num_candidates"], "optimiser": optimiser}
+
+
 AGENTS = {
     "compiled": (DGPMPCAgent, DEEP_GP),
     "pathwise": (DGPMPCAgent, {**DEEP_GP, "compile": False}),
@@ -28,9 +36,9 @@ AGENTS = {
     "PETS": (PETSAgent, PETS),
     "PETS MM": (PETSAgent, {**PETS, "draw": "MM"}),
     "GP": (GPMPCAgent, GP),
-    "gradient": (DGPMPCAgent, {**DEEP_GP, "planner": "gradient"}),
-    "PETS, gradient": (PETSAgent, {**PETS, "draw": "TSinf", "planner": "gradient", "optimiser": "adam"}),
-    "GP, gradient": (GPMPCAgent, {**GP, "draw": "DS", "planner": "gradient", "optimiser": "adam"}),
+    "gradient": (DGPMPCAgent, climbing(DEEP_GP, "lbfgs")),
+    "PETS, gradient": (PETSAgent, {**climbing(PETS, "adam"), "draw": "TSinf"}),
+    "GP, gradient": (GPMPCAgent, {**climbing(GP, "adam"), "draw": "DS"}),
     "GP AMM": (GPMPCAgent, {**GP, "draw": "AMM", "num_particles": 4}),
 }
 

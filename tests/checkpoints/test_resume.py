@@ -111,7 +111,8 @@ def test_a_killed_run_ends_as_the_whole_one(whole, tmp_path, kills, every):
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_the_plans_of_every_planner_go_on(planner, tmp_path):
     """What they carry, such as elites, is in the checkpoint within an episode, bit by bit."""
-    settings = {"planner": planner, "horizon": 4, "num_candidates": 30, "num_iterations": 2, "actions_per_plan": 2}
+    sequences = "num_starts" if planner == "gradient" else "num_candidates"
+    settings = {"planner": planner, "horizon": 4, sequences: 30, "num_iterations": 2, "actions_per_plan": 2}
     settings |= {"total": LENGTH + 8, "logs": False}
     train(tmp_path / "whole", **settings)
     train(tmp_path / "parts", kill_at=LENGTH + 5, every=3, **settings)
