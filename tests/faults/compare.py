@@ -57,9 +57,15 @@ def log_differences(one, other):
 
 
 def points(folder):
-    """Tag -> list of (step, value), in the order of the files and of what is in them."""
+    """Tag -> list of (step, value), in the order of the files and of what is in them.
+
+    Files of one second are told apart by a number that counts a process's writers: 10 comes after 9.
+    """
     found = {}
-    for path in sorted(Path(folder).rglob("events*")):
+    files = Path(folder).rglob("events*")
+    for path in sorted(
+        files, key=lambda path: (str(path.parent), [int(part) for part in re.findall(r"\d+", path.name)])
+    ):
         for record in RawEventFileLoader(str(path)).Load():
             event = Event.FromString(record)
             for value in event.summary.value:
