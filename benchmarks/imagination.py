@@ -70,9 +70,9 @@ def _dyna(wanted: Row) -> Row:
         settings["imagined_timesteps"] = wanted["total_timesteps"]
     agent = DynaAgent(task.make(), **settings, seed=wanted["seed"])
     agent.learn((1 + wanted["episodes"]) * task.episode_steps)
-    rewards = agent.store.rewards.reshape(-1, task.episode_steps)
+    returns = np.bincount(agent.store.episodes, agent.store.rewards)
     return {
-        "returns": rewards.sum(1)[1:].tolist(),
+        "returns": returns[1:].tolist(),
         "learning_cpu_minutes": (time.process_time() - started) / 60,
     }
 

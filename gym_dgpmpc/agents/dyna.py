@@ -1,16 +1,19 @@
 """A Dyna of the deep Gaussian process: act by a policy, learn the model, let the policy learn in the model's worlds.
 
-Sutton (1991), "Dyna, an Integrated Architecture for Learning, Planning, and Reacting"; with an ensemble of networks and
-SAC it is MBPO, Janner et al. (2019), "When to Trust Your Model: Model-Based Policy Optimization". The deep Gaussian
-process's worlds are functions, drawn anew for each imagined episode, and last for whole episodes.
+Sutton (1991), "Dyna, an Integrated Architecture for Learning, Planning, and Reacting". Nearest to it is MBPO, which has
+an ensemble of networks: Janner et al. (2019), "When to Trust Your Model: Model-Based Policy Optimization"; what differs
+is in docs/deviations.md.
 """
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from stable_baselines3.common.base_class import BaseAlgorithm
+
 from gym_dgpmpc.agents.dgp_mpc import DGPMPCAgent
 from gym_dgpmpc.checkpoints.interface import StateOf
-from gym_dgpmpc.imagination.controller import PolicyController, improvement_seed
+from gym_dgpmpc.imagination.controller import PolicyController
+from gym_dgpmpc.randomness import derive_seed
 from gym_dgpmpc.types import StateDict, Stateful
 
 if TYPE_CHECKING:
@@ -40,12 +43,12 @@ class DynaAgent(DynaAgentBase):
     controller: PolicyController
 
     @property
-    def imagined_policy(self):
+    def imagined_policy(self) -> BaseAlgorithm | None:
         """The policy, a Stable-Baselines3 algorithm; None before the first training."""
         return self.controller.policy
 
     def _improve(self) -> Mapping[str, float]:
-        return self.controller.improve(self, improvement_seed(self.seed, len(self.store)))
+        return self.controller.improve(self, derive_seed(self.seed, "imagination", len(self.store)))
 
     def nouns(self) -> dict[str, Stateful]:
         """What a checkpoint holds, the policy included."""

@@ -91,12 +91,11 @@ def suited_settings(
         space: of observations.
         features: further arguments of the policy, for vectors of observations.
     """
-    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
-    of_policy = dict(NETWORK) if isinstance(space, spaces.Dict) else {**NETWORK, **features}
+    is_dict = isinstance(space, spaces.Dict)
+    of_policy = {**NETWORK, **({} if is_dict else features)}
     if issubclass(algorithm, PolicyGradient):
         of_policy["activation_fn"] = torch.nn.SiLU  # smooth, as a gradient likes it
-        return {"policy": policy, "policy_kwargs": of_policy}
-    settings: dict[str, Any] = {"policy": policy, "policy_kwargs": of_policy}
+    settings: dict[str, Any] = {"policy": "MultiInputPolicy" if is_dict else "MlpPolicy", "policy_kwargs": of_policy}
     if "gradient_steps" in inspect.signature(algorithm).parameters:
         settings |= {
             "train_freq": 1,

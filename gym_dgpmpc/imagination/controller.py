@@ -24,7 +24,6 @@ from gym_dgpmpc.planning.controller import Acted, Controller
 from gym_dgpmpc.planning.plan_state import PlanState
 from gym_dgpmpc.planning.risk import RiskMeasure
 from gym_dgpmpc.planning.rollout import EXPECTED, Tail
-from gym_dgpmpc.randomness import derive_seed
 from gym_dgpmpc.tasks.dict_observations import original_space, unflattened
 from gym_dgpmpc.tasks.task import Task
 from gym_dgpmpc.types import DynamicsModel, PlanInfo, Planner, StateDict, TransitionSampler
@@ -201,8 +200,3 @@ def _not_asked(*_: Any) -> Any:
 
 _unasked: Any = _not_asked
 """In place of the functions of worlds in which nobody lives."""
-
-
-def improvement_seed(seed: int, num_transitions: int) -> int:
-    """The seed of the imagination that follows a training on so many transitions."""
-    return derive_seed(seed, "imagination", num_transitions)

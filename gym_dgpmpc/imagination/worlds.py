@@ -107,7 +107,7 @@ class ImaginedVecEnv(VecEnv):
         super().__init__(num_worlds, observation_space, action_space)
         self.dynamics, self.reward_fn, self.terminated_fn = dynamics, reward_fn, terminated_fn
         self.episode_steps, self.least_reward = episode_steps, least_reward
-        self._beginnings, self._plausible = beginnings, plausible
+        self._beginnings = beginnings
         is_dict = isinstance(observation_space, spaces.Dict)
         parts = layout_of(observation_space).values() if is_dict else ()
         self.observation_size = max(part.stop for part in parts) if is_dict else flat_size(observation_space)
@@ -116,6 +116,7 @@ class ImaginedVecEnv(VecEnv):
             torch.as_tensor(bound, dtype=dtype, device=device).flatten()
             for bound in (action_space.low, action_space.high)
         )
+        self._plausible = None if plausible is None else plausible.to(self._low)
         self.generator = torch.Generator(device).manual_seed(fresh_seed() if seed is None else seed)
         self._sampler: TransitionSampler | None = None
         self._step = 0  # of the worlds
@@ -269,7 +270,7 @@ class ImaginedVecEnv(VecEnv):
         """Which states are none that an episode can go on from."""
         left = ~after.isfinite().all(-1)
         if self._plausible is not None:
-            left = left | self._plausible.to(after).left(after[..., : self.observation_size])
+            left = left | self._plausible.left(after[..., : self.observation_size])
         return left
 
     def _observed(self, states: Float[Tensor, "n S_all"]) -> VecEnvObs:

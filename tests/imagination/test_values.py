@@ -136,19 +136,6 @@ def test_the_planner_is_told_of_the_policys_sequences_and_values(seeing, monkeyp
     assert seeing.controller.tail(seeing.task).discount == 0.99
 
 
-def test_proposals_are_tried(seeing):
-    """An objective that only a proposal satisfies is found by every planner that takes them."""
-    wanted = torch.full((1, TINY["horizon"], 1), 1.987)
-
-    def objective(actions):
-        return -(actions - wanted).abs().amax((1, 2)).clamp(min=1e-3)
-
-    planner = seeing.planner
-    alone, _ = planner.plan(objective, planner.initial_plan(), torch.Generator().manual_seed(0))
-    helped, _ = planner.plan(objective, planner.initial_plan(), torch.Generator().manual_seed(0), proposals=wanted)
-    assert objective(helped.actions[None]) > objective(alone.actions[None])
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [

@@ -3,6 +3,7 @@
 A plan is read by its `actions` alone; its other fields are compared, stacked and handed back, never interpreted.
 """
 
+import inspect
 import math
 import re
 import time
@@ -46,6 +47,10 @@ def seeded(seed=0):
 
 def near(target):
     return lambda actions: -(actions - target).square().sum(dim=(1, 2))
+
+
+def takes_proposals(planner):
+    return "proposals" in inspect.signature(planner.plan).parameters
 
 
 def made(planner, seed=0, start=None):
@@ -158,6 +163,25 @@ def test_a_score_that_is_not_finite_never_wins(name, bad):
     assert plan.actions[0, 0] <= 0.0
     assert math.isfinite(info.expected_return) and info.expected_return <= 0.0
     assert info.num_nonfinite == counted > 0
+
+
+def test_proposals_are_scored_as_they_are_in_the_place_of_others(name):
+    planner = make(name)
+    if not takes_proposals(planner):
+        return  # they are no part of what every planner must take
+    proposals = torch.tensor([0.93, -1.71]).expand(1, HORIZON, 2)
+    scored = []
+
+    def objective(actions):
+        scored.append(actions.detach().clone())
+        return near(0.2)(actions)
+
+    planner.plan(objective, planner.initial_plan(), seeded())
+    sizes = [len(actions) for actions in scored]
+    scored.clear()
+    planner.plan(objective, planner.initial_plan(), seeded(), proposals=proposals)
+    assert [len(actions) for actions in scored] == sizes  # no more work than without
+    assert any(((actions - proposals).abs().amax((1, 2)) < 1e-6).any() for actions in scored)  # float32, of size 2
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
