@@ -769,8 +769,9 @@ class MPCAgent(BaseAlgorithm):
             policy.save("policy.zip")  # a file of Stable-Baselines3's, for SAC.load
 
         The policy is tried every ``trial_every`` imagined steps in worlds that it never learns in. The best one is
-        returned, and training ends once ``patience`` trials have brought no better one. The environment is not asked.
-        `imagination.policies.imagine` does the same, and returns all trials too.
+        returned, and training ends once ``patience`` trials have brought no better one. The environment is not asked,
+        so look at the policy there before you rely on it: worlds can flatter (docs/imagination.md). `imagine` of
+        `gym_dgpmpc.imagination` does the same, and returns all trials too.
 
         Args:
             algorithm: "SAC", "TD3", "DDPG", "PPO" or "A2C"; "TQC" or "CrossQ" where sb3-contrib is installed; the class
