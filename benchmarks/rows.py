@@ -43,7 +43,7 @@ def measure_missing(
     """Measure what the benchmark's files do not have, and write them again after each measurement.
 
     Args:
-        name: of the benchmark and of its files, ``name.json`` and ``name.md``.
+        name: of the benchmark's module below `benchmarks`; its last part is that of the files, ``.json`` and ``.md``.
         results: their folder.
         wanted: for each measurement everything that makes it another one.
         measure: gives the results of one.
@@ -55,13 +55,13 @@ def measure_missing(
         The page of all rows, those of other settings included.
     """
     page = document if page is None else page
-    file = results / f"{name}.json"
+    file = results / f"{name.rpartition('.')[2]}.json"
     rows = read_rows(file, settings)
     missing = [row for row in wanted if find(rows, **row) is None]
     for row, found in _measured(missing, measure, jobs):
         rows.append(row | found | {"command": command(name), "torch": torch.__version__})
         replace_text(file, json.dumps({"rows": rows}, indent=2) + "\n")
-        replace_text(results / f"{name}.md", page(rows))
+        replace_text(file.with_suffix(".md"), page(rows))
     return page(rows)
 
 

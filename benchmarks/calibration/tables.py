@@ -24,7 +24,7 @@ def all_scores(rows: Iterable[Row]) -> list[str]:
     cells = []
     for key, group in _grouped(rows, (*POINT, "model")).items():
         shown = [f"{_mean(group, score):.{3 if score in ('crps', 'rmse') else 2}f}" for score in SCORES]
-        shown[SCORES.index("nll")] = _with_error([row["nll"] for row in group])
+        shown[SCORES.index("nll")] = with_error([row["nll"] for row in group])
         cells.append([*map(str, key), str(len(group)), *shown])
     return markdown.table(["task", "episodes", "test", "steps", "model", "seeds", *SCORES], cells)
 
@@ -45,7 +45,7 @@ def beside_rivals(rows: Iterable[Row]) -> list[str]:
         counts["points"] += 1
         counts["coverage"] += GOOD_COVERAGE[0] <= coverage <= GOOD_COVERAGE[1]
         counts["z2"] += GOOD_Z2[0] <= z2 <= GOOD_Z2[1]
-        shown = [str(len(ours)), f"{100 * coverage:.0f}", f"{z2:.2f}", _with_error([row["nll"] for row in ours])]
+        shown = [str(len(ours)), f"{100 * coverage:.0f}", f"{z2:.2f}", with_error([row["nll"] for row in ours])]
         for rival in RIVALS:
             common = by_model[OURS].keys() & by_model[rival].keys()
             differences = [by_model[OURS][seed]["nll"] - by_model[rival][seed]["nll"] for seed in sorted(common)]
@@ -73,7 +73,8 @@ def _mean(rows: Iterable[Row], score: str) -> float:
     return fmean(row[score] for row in rows)
 
 
-def _with_error(values: list[float]) -> str:
+def with_error(values: list[float]) -> str:
+    """Their mean, and its standard error."""
     error = f" ± {stdev(values) / len(values) ** 0.5:.2f}" if len(values) > 1 else ""
     return f"{fmean(values):.2f}{error}"
 
@@ -82,4 +83,4 @@ def _difference(values: list[float]) -> str:
     if not values:
         return markdown.NOTHING
     is_clear = len(values) > 1 and fmean(values) < -2.0 * stdev(values) / len(values) ** 0.5
-    return f"**{_with_error(values)}**" if is_clear else _with_error(values)
+    return f"**{with_error(values)}**" if is_clear else with_error(values)

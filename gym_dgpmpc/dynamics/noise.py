@@ -171,6 +171,8 @@ def consecutive(data: Transitions, encoder: Encoder) -> tuple[list[int], list[in
 def _spread(data: Transitions, encoder: Encoder) -> Float[Tensor, "T"]:
     """Variance of every predicted number given the others and the action (linearly); infinite where it is not fed."""
     fed = [i for i in encoder.predicted if i in (*encoder.plain, *encoder.angles)]
+    if not fed:
+        return data.observation.new_full((encoder.target_size,), torch.inf)
     columns = torch.cat([data.observation[:, fed], data.action], 1)
     variance, mean = torch.var_mean(columns, 0, correction=0)
     scaled = (columns - mean) / torch.where(variance > 0, variance, 1.0).sqrt()

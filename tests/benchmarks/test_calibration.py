@@ -168,6 +168,25 @@ def test_a_regression_reads_its_inputs_alone():
     assert inputs.tolist() == x.tolist() and targets.flatten().tolist() == y.tolist()
 
 
+def test_large_sets_are_trained_for_as_many_passes_and_small_ones_for_the_defaults():
+    """128 passes over 8,000 rows in minibatches of 256 are 4,000 iterations; over 300 they are fewer than 1,000."""
+    assert uci._iterations("DGP L=2", 8000) == {"first_training_iterations": 4000}
+    assert uci._iterations("DGP L=2", 300) == {"first_training_iterations": 1000}
+    assert uci._iterations("sparse GP", 8000) == {}
+
+
+def test_the_page_of_regressions_has_means_over_splits_beside_what_was_published():
+    about = {"command": "python -m benchmarks.calibration.uci FOLDER", "revision": "abc", "set": "boston"}
+    rows = [
+        about | {"split": split, "model": "DGP L=2", "log_likelihood": value, "rmse": 2.0 + split, "z2": 1.0}
+        for split, value in enumerate((-2.0, -2.5, -3.0))
+    ]
+    page = uci.page(rows)
+    error = 0.5 / 3**0.5
+    assert f"| boston | -2.50 ± {error:.2f}; 3; 1.00; 3 | -2.51 ± 0.07 | -2.43 ± 0.05 |" in page
+    assert "abc" in page and "energy" not in page
+
+
 def row(model, seed, nll, coverage=0.9, z2=1.0, horizon=1):
     found = dict.fromkeys(SCORES, 0.25) | {"nll": nll, "coverage_90": coverage, "z2": z2}
     return {"model": model, "seed": seed, "task": "cartpole", "episodes": 1, "test": "on", "horizon": horizon} | found
