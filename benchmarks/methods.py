@@ -18,7 +18,16 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
 
 from benchmarks.tasks import Task
-from gym_dgpmpc.agents import DGPMPCAgent, GPMPCAgent, MixtureMPCAgent, MPCAgent, PETSAgent, presets
+from gym_dgpmpc.agents import (
+    DGPMPCAgent,
+    GPMPCAgent,
+    MCPILCOAgent,
+    MixtureMPCAgent,
+    MPCAgent,
+    PETSAgent,
+    PILCOAgent,
+    presets,
+)
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.gp.kernels import KERNELS
 from gym_dgpmpc.planning.registry import planner_factory, settings_of_others
@@ -252,6 +261,11 @@ ALL_METHODS: tuple[Method, ...] = (
         for name, noise in (("", False), (" with noise", True))
     ),
     PlanningMethod("DGP L=2 and PETS", MixtureMPCAgent, _mixed, {"ensemble_half_precision": True}),
+    PlanningMethod("MC-PILCO", MCPILCOAgent, _of(presets.POLICY_SEARCH)),
+    PlanningMethod(
+        "MC-PILCO DGP L=2", MCPILCOAgent, _of(presets.POLICY_SEARCH), {"num_layers": 2, "kernel": "matern32"}
+    ),
+    PlanningMethod("PILCO", PILCOAgent, _of(presets.POLICY_SEARCH)),
     PlanningMethod("true dynamics", true_dynamics_agent, _planning_alone),
     ModelFreeMethod("SAC", SAC, _off_policy),
     ModelFreeMethod("TD3", TD3, lambda task: {**_off_policy(task), "exploration_noise": TD3_NOISE}),

@@ -8,9 +8,11 @@ if TYPE_CHECKING:
     from gym_dgpmpc.agents import DGPMPCAgent as DGPMPCAgent
     from gym_dgpmpc.agents import DynaAgent as DynaAgent
     from gym_dgpmpc.agents import GPMPCAgent as GPMPCAgent
+    from gym_dgpmpc.agents import MCPILCOAgent as MCPILCOAgent
     from gym_dgpmpc.agents import MixtureMPCAgent as MixtureMPCAgent
     from gym_dgpmpc.agents import MPCAgent as MPCAgent
     from gym_dgpmpc.agents import PETSAgent as PETSAgent
+    from gym_dgpmpc.agents import PILCOAgent as PILCOAgent
     from gym_dgpmpc.agents.presets import mixture_settings_for as mixture_settings_for
     from gym_dgpmpc.agents.presets import settings_for as settings_for
     from gym_dgpmpc.envs.registration import *  # noqa: F403
@@ -20,7 +22,17 @@ if TYPE_CHECKING:
 # Public name -> the module it is imported from on first use, so that `import gym_dgpmpc` stays light.
 _MODULE_OF = {
     **dict.fromkeys(
-        ("DGPMPCAgent", "DynaAgent", "GPMPCAgent", "MPCAgent", "MixtureMPCAgent", "PETSAgent"), "gym_dgpmpc.agents"
+        (
+            "DGPMPCAgent",
+            "DynaAgent",
+            "GPMPCAgent",
+            "MCPILCOAgent",
+            "MPCAgent",
+            "MixtureMPCAgent",
+            "PETSAgent",
+            "PILCOAgent",
+        ),
+        "gym_dgpmpc.agents",
     ),
     **dict.fromkeys(("settings_for", "mixture_settings_for"), "gym_dgpmpc.agents.presets"),
     "ImaginedVecEnv": "gym_dgpmpc.imagination",

@@ -25,6 +25,7 @@ LAYERS = (
     {"tasks"},
     {"planning"},
     {"imagination"},
+    {"policy_search"},
     {"checkpoints"},
     {"agents"},
     {"runs"},

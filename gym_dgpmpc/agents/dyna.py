@@ -5,16 +5,13 @@ an ensemble of networks: Janner et al. (2019), "When to Trust Your Model: Model-
 is in docs/deviations.md.
 """
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from gym_dgpmpc.agents.acting import PolicyAgent
 from gym_dgpmpc.agents.dgp_mpc import DGPMPCAgent
-from gym_dgpmpc.checkpoints.interface import StateOf
 from gym_dgpmpc.imagination.controller import PolicyController
-from gym_dgpmpc.randomness import derive_seed
-from gym_dgpmpc.types import StateDict, Stateful
 
 if TYPE_CHECKING:
     from gym_dgpmpc.agents.typed import DynaAgentBase  # DGPMPCAgent with every argument, see `typed.pyi`
@@ -22,7 +19,7 @@ else:
     DynaAgentBase = DGPMPCAgent
 
 
-class DynaAgent(DynaAgentBase):
+class DynaAgent(PolicyAgent, DynaAgentBase):
     """Learns a deep Gaussian process as `DGPMPCAgent` does, and acts by a policy that lives in its worlds.
 
         agent = DynaAgent("ModCartPole-v0", seed=0, verbose=1)
@@ -46,13 +43,3 @@ class DynaAgent(DynaAgentBase):
     def imagined_policy(self) -> BaseAlgorithm | None:
         """The policy, a Stable-Baselines3 algorithm; None before the first training."""
         return self.controller.policy
-
-    def _improve(self) -> Mapping[str, float]:
-        return self.controller.improve(self, derive_seed(self.seed, "imagination", len(self.store)))
-
-    def nouns(self) -> dict[str, Stateful]:
-        """What a checkpoint holds, the policy included."""
-        return super().nouns() | {"policy": StateOf(self.controller.state_dict, self._load_policy)}
-
-    def _load_policy(self, state: StateDict) -> None:
-        self.controller.load_policy(self, state)

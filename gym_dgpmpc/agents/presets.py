@@ -199,3 +199,22 @@ def mixture_settings_for(env_id: str) -> Mapping[str, Any]:
     # Networks have fresh noise at each call, with which L-BFGS does not climb.
     climbs = settings_for(env_id).get("planner") == "gradient"
     return for_mixture(settings_for(env_id, "cem" if climbs else None), NETWORKS.get(env_id.rpartition(":")[2], {}))
+
+
+POLICY_SEARCH = MappingProxyType(
+    {
+        "ModCartPole-v0": MappingProxyType({"exploration": "held", "search_horizon": 75}),
+        "SwingUpCartPole-v0": MappingProxyType({"exploration": "held", "search_horizon": 75}),
+    }
+)
+"""Settings of `MCPILCOAgent` and `PILCOAgent` that spare time: a swing-up is over after 75 of these tasks' 200 steps.
+Nothing was measured with them."""
+
+
+def policy_search_settings_for(env_id: str) -> Mapping[str, Any]:
+    """Settings of `MCPILCOAgent` and `PILCOAgent` for a task, none if it has no preset.
+
+    Args:
+        env_id: as in `settings_for`.
+    """
+    return POLICY_SEARCH.get(env_id.rpartition(":")[2], {})

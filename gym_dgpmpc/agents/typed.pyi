@@ -4,6 +4,7 @@ Written by `python -m tests.agents.typed` from the settings of the agents' parts
 """
 
 from collections.abc import Callable, Sequence
+from gym_dgpmpc.agents.acting import PolicyAgent
 from gym_dgpmpc.agents.dgp_mpc import DGPMPCAgent
 from gym_dgpmpc.agents.mpc import MPCAgent
 from gym_dgpmpc.types import ObservationSpec, Planner, RewardFn, TerminatedFn
@@ -418,6 +419,179 @@ class GPMPCAgentBase(MPCAgent):
     @property
     def min_std(self) -> float: ...
 
+class MCPILCOAgentBase(PolicyAgent):
+    def __init__(
+        self,
+        *args: str | type[BasePolicy] | Env | VecEnv | None,
+        policy: str | type[BasePolicy] = "MPCPolicy",
+        env: Env | VecEnv | str | None = None,
+        num_layers: int = 1,
+        kernel: Literal["rbf", "matern72", "matern52", "matern32", "matern12"] = "rbf",
+        linear: bool = False,
+        num_inducing: int = 100,
+        draw: Literal["pathwise", "joint", "marginal"] = "pathwise",
+        refresh: Literal["step", "plan"] = "plan",
+        num_features: int = 64,
+        first_training_iterations: int = 1000,
+        training_iterations: int = 300,
+        num_chains: int = 5,
+        num_samples: int = 100,
+        sample_spacing: int = 20,
+        resample_samples: int = 5,
+        relocate: bool = True,
+        add_noise: bool = True,
+        split_noise: bool = True,
+        compile: bool = True,
+        step_size: float = 0.1,
+        decay: float = 0.05,
+        hyperparameters: Literal["sampled", "optimised"] = "optimised",
+        hyperparameter_step_size: float = 0.02,
+        learning_rate: float = 0.1,
+        hyperparameters_every: int = 1,
+        window_size: int = 1,
+        batch_size: int = 256,
+        gibbs_every: int = 20,
+        gibbs_rows: int = 4096,
+        patience: int | None = None,
+        look_every: int = 100,
+        num_worlds: int = 25,
+        num_paths: int = 8,
+        first_search_steps: int = 500,
+        search_steps: int = 300,
+        search_step_size: float = 0.01,
+        policy_dropout: float = 0.25,
+        policy_form: Literal["rbf", "linear"] = "rbf",
+        num_centres: int = 100,
+        search_horizon: int | None = None,
+        horizon: int = 30,
+        num_candidates: int = 300,
+        num_elites: int | None = None,
+        num_iterations: int = 5,
+        smoothing: float = 0.1,
+        min_std: float = 0.005,
+        num_particles: int = 5,
+        actions_per_plan: int = 1,
+        risk: Literal["mean", "mean-std", "cvar", "worst", "best"] = "mean",
+        risk_aversion: float = 1.0,
+        cvar_share: float = 0.2,
+        learning_starts: int | None = None,
+        exploration: Literal["uniform", "held", "coloured", "chirp"] = "uniform",
+        exploration_hold: int = 5,
+        exploration_beta: float = 1.0,
+        train_freq: int | None = None,
+        observation_spec: ObservationSpec | None = None,
+        time_budget: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | PathLike[str] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        planner: Literal["cem", "icem", "mppi", "gradient"] | str | Callable[..., Planner] | Planner | None = "cem",
+        reward_fn: RewardFn | Literal["learned"] | None = None,
+        terminated_fn: TerminatedFn | Literal["learned"] | Literal["never"] | None = None,
+        first_controller: Callable[[Any], Any] | None = None,
+        device: device | str = "cpu",
+        noise_beta: float = 0.25,
+        fraction_elites_reused: float = 0.3,
+        factor_decrease_num: float = 1.25,
+        start_std: float = 0.25,
+        temperature: float = 0.5,
+        standardise: bool = True,
+        noise_std: float = 0.25,
+        control_cost: float = 0.0,
+        num_starts: int = 4,
+        optimiser: Literal["adam", "lbfgs"] = "lbfgs",
+        action_step: float = 0.1,
+        start_from: Literal["plan", "cem"] = "plan",
+        cem_candidates: int = 100,
+        cem_iterations: int = 3,
+    ) -> None: ...
+    @property
+    def num_layers(self) -> int: ...
+    @property
+    def kernel(self) -> Literal["rbf", "matern72", "matern52", "matern32", "matern12"]: ...
+    @property
+    def linear(self) -> bool: ...
+    @property
+    def num_inducing(self) -> int: ...
+    @property
+    def draw(self) -> Literal["pathwise", "joint", "marginal"]: ...
+    @property
+    def refresh(self) -> Literal["step", "plan"]: ...
+    @property
+    def num_features(self) -> int: ...
+    @property
+    def first_training_iterations(self) -> int: ...
+    @property
+    def training_iterations(self) -> int: ...
+    @property
+    def num_chains(self) -> int: ...
+    @property
+    def num_samples(self) -> int: ...
+    @property
+    def sample_spacing(self) -> int: ...
+    @property
+    def resample_samples(self) -> int: ...
+    @property
+    def relocate(self) -> bool: ...
+    @property
+    def add_noise(self) -> bool: ...
+    @property
+    def split_noise(self) -> bool: ...
+    @property
+    def compile(self) -> bool: ...
+    @property
+    def step_size(self) -> float: ...
+    @property
+    def decay(self) -> float: ...
+    @property
+    def hyperparameters(self) -> Literal["sampled", "optimised"]: ...
+    @property
+    def hyperparameter_step_size(self) -> float: ...
+    @property
+    def hyperparameters_every(self) -> int: ...
+    @property
+    def window_size(self) -> int: ...
+    @property
+    def batch_size(self) -> int: ...
+    @property
+    def gibbs_every(self) -> int: ...
+    @property
+    def gibbs_rows(self) -> int: ...
+    @property
+    def patience(self) -> int | None: ...
+    @property
+    def look_every(self) -> int: ...
+    @property
+    def num_worlds(self) -> int: ...
+    @property
+    def num_paths(self) -> int: ...
+    @property
+    def first_search_steps(self) -> int: ...
+    @property
+    def search_steps(self) -> int: ...
+    @property
+    def search_step_size(self) -> float: ...
+    @property
+    def policy_dropout(self) -> float: ...
+    @property
+    def policy_form(self) -> Literal["rbf", "linear"]: ...
+    @property
+    def num_centres(self) -> int: ...
+    @property
+    def search_horizon(self) -> int | None: ...
+    @property
+    def horizon(self) -> int: ...
+    @property
+    def num_candidates(self) -> int: ...
+    @property
+    def num_elites(self) -> int | None: ...
+    @property
+    def num_iterations(self) -> int: ...
+    @property
+    def smoothing(self) -> float: ...
+    @property
+    def min_std(self) -> float: ...
+
 class MixtureMPCAgentBase(MPCAgent):
     def __init__(
         self,
@@ -717,6 +891,91 @@ class PETSAgentBase(MPCAgent):
     def split_noise(self) -> bool: ...
     @property
     def half_precision(self) -> bool: ...
+    @property
+    def horizon(self) -> int: ...
+    @property
+    def num_candidates(self) -> int: ...
+    @property
+    def num_elites(self) -> int | None: ...
+    @property
+    def num_iterations(self) -> int: ...
+    @property
+    def smoothing(self) -> float: ...
+    @property
+    def min_std(self) -> float: ...
+
+class PILCOAgentBase(PolicyAgent):
+    def __init__(
+        self,
+        *args: str | type[BasePolicy] | Env | VecEnv | None,
+        policy: str | type[BasePolicy] = "MPCPolicy",
+        env: Env | VecEnv | str | None = None,
+        num_inducing: int = 100,
+        exact: bool = False,
+        max_training_iterations: int = 200,
+        num_points: int = 50,
+        max_search_iterations: int = 100,
+        policy_form: Literal["rbf", "linear"] = "rbf",
+        num_centres: int = 100,
+        search_horizon: int | None = None,
+        horizon: int = 30,
+        num_candidates: int = 300,
+        num_elites: int | None = None,
+        num_iterations: int = 5,
+        smoothing: float = 0.1,
+        min_std: float = 0.005,
+        num_particles: int = 5,
+        actions_per_plan: int = 1,
+        risk: Literal["mean", "mean-std", "cvar", "worst", "best"] = "mean",
+        risk_aversion: float = 1.0,
+        cvar_share: float = 0.2,
+        learning_starts: int | None = None,
+        exploration: Literal["uniform", "held", "coloured", "chirp"] = "uniform",
+        exploration_hold: int = 5,
+        exploration_beta: float = 1.0,
+        train_freq: int | None = None,
+        observation_spec: ObservationSpec | None = None,
+        time_budget: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | PathLike[str] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        planner: Literal["cem", "icem", "mppi", "gradient"] | str | Callable[..., Planner] | Planner | None = "cem",
+        reward_fn: RewardFn | Literal["learned"] | None = None,
+        terminated_fn: TerminatedFn | Literal["learned"] | Literal["never"] | None = None,
+        first_controller: Callable[[Any], Any] | None = None,
+        device: device | str = "cpu",
+        noise_beta: float = 0.25,
+        fraction_elites_reused: float = 0.3,
+        factor_decrease_num: float = 1.25,
+        start_std: float = 0.25,
+        temperature: float = 0.5,
+        standardise: bool = True,
+        noise_std: float = 0.25,
+        control_cost: float = 0.0,
+        num_starts: int = 4,
+        optimiser: Literal["adam", "lbfgs"] = "lbfgs",
+        action_step: float = 0.1,
+        start_from: Literal["plan", "cem"] = "plan",
+        cem_candidates: int = 100,
+        cem_iterations: int = 3,
+    ) -> None: ...
+    @property
+    def num_inducing(self) -> int: ...
+    @property
+    def exact(self) -> bool: ...
+    @property
+    def max_training_iterations(self) -> int: ...
+    @property
+    def num_points(self) -> int: ...
+    @property
+    def max_search_iterations(self) -> int: ...
+    @property
+    def policy_form(self) -> Literal["rbf", "linear"]: ...
+    @property
+    def num_centres(self) -> int: ...
+    @property
+    def search_horizon(self) -> int | None: ...
     @property
     def horizon(self) -> int: ...
     @property

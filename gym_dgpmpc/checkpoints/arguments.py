@@ -26,6 +26,8 @@ AGENT_CLASSES = {
     "PETSAgent": "gym_dgpmpc.agents.pets",
     "DynaAgent": "gym_dgpmpc.agents.dyna",
     "MixtureMPCAgent": "gym_dgpmpc.agents.mixture",
+    "MCPILCOAgent": "gym_dgpmpc.agents.mc_pilco",
+    "PILCOAgent": "gym_dgpmpc.agents.pilco",
 }
 """The classes that a file may name, and where they are; nothing else is ever imported for a file."""
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 
 import typer
 
-from gym_dgpmpc.agents import DGPMPCAgent, DynaAgent, MixtureMPCAgent, MPCAgent, presets
+from gym_dgpmpc.agents import DGPMPCAgent, DynaAgent, MCPILCOAgent, MixtureMPCAgent, MPCAgent, PILCOAgent, presets
 from gym_dgpmpc.agents.composition import model_settings
 from gym_dgpmpc.cli.request import DEFAULT_AGENT
 from gym_dgpmpc.cli.train import RUN
@@ -35,6 +35,8 @@ AGENTS: dict[str, Trained] = {
     "dgp-mpc": Trained(DGPMPCAgent, presets.settings_for),
     "dyna": Trained(DynaAgent, presets.settings_for),
     "mixture": Trained(MixtureMPCAgent, presets.mixture_settings_for),
+    "mc-pilco": Trained(MCPILCOAgent, presets.policy_search_settings_for),
+    "pilco": Trained(PILCOAgent, presets.policy_search_settings_for),
 }
 """By name. Their settings of the same name, which are one option, mean the same."""
 
@@ -42,8 +44,9 @@ SET_BY_THE_RUN = {"seed", "verbose", "tensorboard_log", "stats_window_size", "ob
 """Settings of the agent that are not options: the run has them, or they are not plain values."""
 
 AGENT_TEXT = (
-    "What is trained: a planner with a deep Gaussian process; one that acts by a policy from its worlds; or a planner "
-    "with a mixture of models. `--agent NAME --help` shows the options of each."
+    "What is trained: a planner with a deep Gaussian process; one that acts by a policy from its worlds; a planner with a "
+    "mixture of models; or a policy of few parameters that is searched in sampled worlds, or by exact moments. `--agent "
+    "NAME --help` shows the options of each."
 )
 PLANNER_TEXT = "Planner, which optimises action sequences."
 SOURCE_TEXTS = {
@@ -87,8 +90,10 @@ def _options(agent: str) -> Iterable[inspect.Parameter]:
     made_of = AGENTS[agent].agent_class.made_of()
     shown = {*model_settings(made_of), *settings_of(made_of.controller_class)}
     own = MPCAgent.own_settings()
-    groups = [(f"Model of {name}", model_settings(each.agent_class.made_of())) for name, each in AGENTS.items()]
-    groups += [(f"Policy of {name}", settings_of(each.agent_class.controller_class)) for name, each in AGENTS.items()]
+    # The one whose help is shown comes first, so that the defaults are its own.
+    agents = sorted(AGENTS.items(), key=lambda named: named[0] != agent)
+    groups = [(f"Model of {name}", model_settings(each.agent_class.made_of())) for name, each in agents]
+    groups += [(f"Policy of {name}", settings_of(each.agent_class.controller_class)) for name, each in agents]
     groups += [("Planner", {n: s for n, s in own.items() if n in _PLANNING})]
     groups += [("Planner", settings_of(planner_factory(name))) for name in PLANNERS]
     groups += [("Training", {n: s for n, s in own.items() if n not in _PLANNING})]

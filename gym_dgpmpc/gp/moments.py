@@ -73,8 +73,8 @@ def _moments(predictor: Predictor, mean: Tensor, covariance: Tensor) -> Moments:
     root = cholesky(eye + 2.0 * spread, one, jitter=0.0)
     shrunk = torch.cholesky_solve(difference.mT, root).mT  # W d, "K M D"
     own = -0.25 * (difference * (difference + shrunk)).sum(-1)
-    second = torch.baddbmm(own.unsqueeze(-1) + own.unsqueeze(-2), 0.5 * difference, (difference - shrunk).mT).exp_()
-    second /= root.diagonal(dim1=-2, dim2=-1).prod(-1).view(-1, 1, 1)  # E[r r^T], "K M M"
+    second = torch.baddbmm(own.unsqueeze(-1) + own.unsqueeze(-2), 0.5 * difference, (difference - shrunk).mT).exp()
+    second = second / root.diagonal(dim1=-2, dim2=-1).prod(-1).view(-1, 1, 1)  # E[r r^T], "K M M"
     products = weights.mT @ (second @ weights)
     reduced = second.flatten(1) @ predictor.reduction.flatten(1).mT
     variance = (predictor.variance - reduced).clamp_min(0.0)

@@ -1,8 +1,7 @@
 """A controller that learns a policy in the model's worlds after every training, and acts by it."""
 
 import inspect
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
@@ -13,26 +12,23 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import Tensor
 
 from gym_dgpmpc.checks import check_counts
-from gym_dgpmpc.errors import PlanningError
+from gym_dgpmpc.imagination.acting import ActingByPolicy
 from gym_dgpmpc.imagination.algorithms import AlgorithmName, algorithm_class, budget_of, suited_settings
 from gym_dgpmpc.imagination.features import encoding
 from gym_dgpmpc.imagination.global_randomness import lent_randomness
 from gym_dgpmpc.imagination.policies import imagine, learned_parameters, take_over
 from gym_dgpmpc.imagination.values import learns_values, state_value
 from gym_dgpmpc.imagination.worlds import ImaginedVecEnv, Imagining
-from gym_dgpmpc.planning.controller import Acted, Controller
-from gym_dgpmpc.planning.plan_state import PlanState
 from gym_dgpmpc.planning.risk import RiskMeasure
 from gym_dgpmpc.planning.rollout import EXPECTED, Tail
 from gym_dgpmpc.tasks.dict_observations import original_space, unflattened
 from gym_dgpmpc.tasks.task import Task
-from gym_dgpmpc.types import DynamicsModel, PlanInfo, Planner, StateDict, TransitionSampler
+from gym_dgpmpc.types import DynamicsModel, Planner, StateDict, TransitionSampler
 
 ActsBy = Literal["policy", "planner"]
-_NOTHING_PLANNED = PlanInfo(float("nan"))
 
 
-class PolicyController(Controller):
+class PolicyController(ActingByPolicy):
     """Acts by a policy that an algorithm of Stable-Baselines3 learns in the model's worlds.
 
     Args:
@@ -96,7 +92,6 @@ class PolicyController(Controller):
         self.acts_by, self.imagined_timesteps, self.num_worlds = acts_by, imagined_timesteps, num_worlds
         self.trial_every, self.trial_patience = trial_every, trial_patience
         self.policy: BaseAlgorithm | None = None
-        """What has been learned; None before the first training."""
 
     def improve(self, agent: Imagining, seed: int) -> dict[str, float]:
         """Go on learning in the worlds of the agent's model as it is now; metrics to log.
@@ -121,29 +116,12 @@ class PolicyController(Controller):
             "imagination_seconds": imagined.seconds,
         }
 
-    @torch.no_grad()
-    def act(
-        self,
-        task: Task,
-        observation: np.ndarray,
-        carried: PlanState,
-        generator: torch.Generator,
-        worlds: Callable[[], TransitionSampler] | None = None,
-    ) -> Acted:
-        """The policy's action, without noise; or the planner's, see `Controller.act`.
-
-        Raises:
-            PlanningError: the policy returned an action that is not finite; or see `Controller.act`.
-        """
+    def decide(self, task: Task, observation: np.ndarray) -> np.ndarray | None:
+        """The policy's action, without noise; None before the first training, and if the planner acts."""
         if self.policy is None or self.acts_by == "planner":
-            return super().act(task, observation, carried, generator, worlds)
-        started = time.perf_counter()
+            return None
         asked = unflattened(observation[None], self.policy.observation_space)
-        action = np.asarray(self.policy.predict(asked, deterministic=True)[0], dtype=np.float32).reshape(-1)
-        if not np.isfinite(action).all():
-            raise PlanningError(f"the policy returned the action {action} at the observation {observation}")
-        action = torch.from_numpy(action).to(self._low).clamp(self._low, self._high).cpu().numpy()
-        return Acted(action, self.cold, _NOTHING_PLANNED, time.perf_counter() - started, False)
+        return np.asarray(self.policy.predict(asked, deterministic=True)[0], dtype=np.float32).reshape(-1)
 
     def tail(self, task: Task) -> Tail | None:
         """The value that the policy's critics give to the states after a plan."""

@@ -82,28 +82,39 @@ class PolicyGradient(TD3):
             self.policy.set_training_mode(True)
             for group in optimiser.param_groups:
                 group["lr"] = first * (1.0 - 0.9 * self.num_timesteps / total_timesteps)
-            mean_reward = paths.mean_reward(actor)
-            if not mean_reward.requires_grad:
-                raise NotDifferentiableError(
-                    "no gradient comes through the reward: it must follow from its arguments by differentiable "
-                    "operations of PyTorch. Take another algorithm, such as SAC, which needs none"
-                )
-            optimiser.zero_grad()
-            (-mean_reward).backward()
-            # Of length one: a policy that begins to succeed has gradients a thousand times smaller than one that fails,
-            # which Adam would remember for too long.
-            gradients = [parameter.grad for parameter in actor.parameters() if parameter.grad is not None]
-            norm = torch.stack([gradient.norm() for gradient in gradients]).norm()
-            if norm.isfinite() and norm > 0:
-                for gradient in gradients:
-                    gradient.div_(norm)
-                optimiser.step()
+            mean_reward = climb(paths, actor, optimiser)
             self.num_timesteps += paths.num_steps
-            self.logger.record("train/mean_reward", mean_reward.item())
+            self.logger.record("train/mean_reward", mean_reward)
             if not callback.on_step():
                 break
         callback.on_training_end()
         return self
+
+
+def climb(paths: "Paths", actor: torch.nn.Module, optimiser: torch.optim.Optimizer) -> float:
+    """One step of the optimiser up the mean reward of an actor's paths, which is returned as it was before.
+
+    The gradient has length one: a policy that begins to succeed has gradients a thousand times smaller than one that
+    fails, which Adam would remember for too long. Nothing is done where it is zero or not finite.
+
+    Raises:
+        NotDifferentiableError: no gradient comes through the reward, or through the model's draws.
+    """
+    mean_reward = paths.mean_reward(actor)
+    if not mean_reward.requires_grad:
+        raise NotDifferentiableError(
+            "no gradient comes through the reward: it must follow from its arguments by differentiable operations of "
+            "PyTorch. Take another algorithm, such as SAC, which needs none"
+        )
+    optimiser.zero_grad()
+    (-mean_reward).backward()
+    gradients = [parameter.grad for parameter in actor.parameters() if parameter.grad is not None]
+    norm = torch.stack([gradient.norm() for gradient in gradients]).norm()
+    if norm.isfinite() and norm > 0:
+        for gradient in gradients:
+            gradient.div_(norm)
+        optimiser.step()
+    return mean_reward.item()
 
 
 class Paths:
@@ -114,10 +125,14 @@ class Paths:
         horizon: H.
         num_paths: K, in each of its n worlds.
         action_noise: standard deviation of the noise on actions, of half their range.
+        goes_on: share of the paths that begin where the last ones ended.
     """
 
-    def __init__(self, env: ImaginedVecEnv, horizon: int, num_paths: int, action_noise: float):
+    def __init__(
+        self, env: ImaginedVecEnv, horizon: int, num_paths: int, action_noise: float, goes_on: float = GOES_ON
+    ):
         self._env, self._horizon, self._num_paths, self._action_noise = env, horizon, num_paths, action_noise
+        self._share_that_goes_on = goes_on
         self.num_steps = horizon * num_paths * env.num_envs
         """Imagined steps of all paths together."""
         self._states: Float[Tensor, "n K S_all"] | None = None
@@ -156,5 +171,5 @@ class Paths:
         if self._states is None or self._ended is None:
             return fresh
         chance = torch.rand(shape, generator=env.generator, dtype=torch.float32, device=fresh.device)
-        goes_on = (chance < GOES_ON) & ~self._ended
+        goes_on = (chance < self._share_that_goes_on) & ~self._ended
         return torch.where(goes_on.unsqueeze(-1), self._states, fresh)

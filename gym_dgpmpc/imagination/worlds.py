@@ -133,6 +133,7 @@ class ImaginedVecEnv(VecEnv):
         episode_steps: int | None = None,
         starts: StartName | StartFunction = "mixed",
         seed: int | None = None,
+        is_limited: bool = True,
     ) -> "ImaginedVecEnv":
         """The worlds of an agent's model, with the rewards and terminations that it plans for.
 
@@ -143,6 +144,7 @@ class ImaginedVecEnv(VecEnv):
             starts: "starts", the first observations of recorded episodes; "states", any recorded observations;
                 "mixed", each with equal chances; or a function (n, NumPy generator) -> observations [n, S].
             seed: of worlds and beginnings; None draws one.
+            is_limited: whether episodes end where states leave the plausible range.
 
         Raises:
             ValueError: the agent has not learned yet, or an argument is out of its range.
@@ -167,7 +169,7 @@ class ImaginedVecEnv(VecEnv):
             size=task.modelled.size,
             num_worlds=num_worlds,
             episode_steps=episode_steps,
-            plausible=Plausible.of(agent.store, task.modelled.observation_spec),
+            plausible=Plausible.of(agent.store, task.modelled.observation_spec) if is_limited else None,
             least_reward=float(reward_fn(known.observation, known.action, known.next_observation).min()),
             seed=seed,
             device=agent.device,

@@ -42,7 +42,7 @@ def generated() -> str:
 
 
 def _class(agent: type[MPCAgent], modules: set[tuple[str, str]]) -> Iterator[str]:
-    base = agent.__mro__[1]
+    base = agent.__bases__[-1]
     modules.add((base.__module__, base.__name__))
     yield f"class {agent.__name__}Base({base.__name__}):"
     yield "    def __init__("
