@@ -44,9 +44,9 @@ SET_BY_THE_RUN = {"seed", "verbose", "tensorboard_log", "stats_window_size", "ob
 """Settings of the agent that are not options: the run has them, or they are not plain values."""
 
 AGENT_TEXT = (
-    "What is trained: a planner with a deep Gaussian process; one that acts by a policy from its worlds; a planner with a "
-    "mixture of models; or a policy of few parameters that is searched in sampled worlds, or by exact moments. `--agent "
-    "NAME --help` shows the options of each."
+    "What is trained: a planner with a deep Gaussian process; one that acts by a policy from its worlds; a planner "
+    "with a mixture of models; or a policy of few parameters, searched in sampled worlds or by exact moments. "
+    "`--agent NAME --help` shows the options of each."
 )
 PLANNER_TEXT = "Planner, which optimises action sequences."
 SOURCE_TEXTS = {

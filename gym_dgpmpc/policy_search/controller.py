@@ -1,7 +1,7 @@
 """Controllers that act by a policy of few parameters, and search a better one after each training of the model."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 import torch
@@ -19,7 +19,6 @@ from gym_dgpmpc.planning.rollout import EXPECTED
 from gym_dgpmpc.policy_search.moments import Belief, BeliefPath, Bounds, search
 from gym_dgpmpc.policy_search.policies import Fed, LinearPolicy, PolicyForm, RBFPolicy, SquashedPolicy, SquashName
 from gym_dgpmpc.policy_search.samples import SampledSearch
-from gym_dgpmpc.randomness import derive_seed
 from gym_dgpmpc.tasks.environment import time_limit
 from gym_dgpmpc.tasks.task import Task
 from gym_dgpmpc.types import DynamicsModel, Planner, StateDict
@@ -100,12 +99,10 @@ class PolicySearchController(ActingByPolicy):
 
     def _first_policy(self, agent: Imagining, seed: int) -> SquashedPolicy:
         fed = Fed.of(agent.store, agent.task.modelled.observation_spec, agent.task.modelled.size)
-        size, policy = len(self._low), None
         if self.policy_form == "linear":
-            policy = LinearPolicy(fed, size, self.squash)
-        else:
-            generator = torch.Generator("cpu").manual_seed(derive_seed(seed, "imagination", 0))
-            policy = RBFPolicy(fed, size, self.squash, self.num_centres, generator)
+            return LinearPolicy(fed, len(self._low), self.squash).to(self.device, self.precision)
+        generator = torch.Generator("cpu").manual_seed(seed)
+        policy = RBFPolicy(fed, len(self._low), self.squash, self.num_centres, generator)
         return policy.to(self.device, self.precision)
 
     def _horizon_of(self, agent: Imagining) -> int:
@@ -148,9 +145,9 @@ class SampledSearchController(PolicySearchController):
         *,
         num_worlds: int = 25,
         num_paths: int = 8,
-        first_search_steps: int = 500,
+        first_search_steps: int = 300,
         search_steps: int = 300,
-        search_step_size: float = 0.01,
+        search_step_size: float = 0.03,
         policy_dropout: float = 0.25,
         device: torch.device | str = "cpu",
         **policy: Any,

@@ -25,7 +25,7 @@ from gym_dgpmpc.policy_search.policies import SquashedPolicy
 from gym_dgpmpc.types import RewardFn
 
 SPREAD_JITTER = 1e-9
-"""Of the largest variance, added to a belief's covariance where its points are spread: what is known has none."""
+"""Of the mean variance, added to a belief's covariance where its points are spread: what is known has none."""
 
 
 class Belief(NamedTuple):
@@ -105,7 +105,7 @@ class BeliefPath:
 
     def _points(self, belief: Belief) -> Float[Tensor, "P n"]:
         """Points with the belief's mean and, up to the jitter, its covariance."""
-        scale = belief.covariance.detach().diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-12).view(-1, 1, 1)
+        scale = belief.covariance.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(1e-12).view(-1, 1, 1)
         root = cholesky(belief.covariance, scale, jitter=SPREAD_JITTER)[0]
         return belief.mean + self._frame[:, : len(root)] @ root.mT
 
@@ -119,32 +119,43 @@ def search(policy: SquashedPolicy, path: BeliefPath, max_iterations: int) -> dic
         NotDifferentiableError: no gradient comes through the reward.
     """
     parameters = list(policy.parameters())
-    worst = -math.inf  # of the negative returns
+    start = torch.nn.utils.parameters_to_vector(parameters).detach().cpu().numpy().copy()
+    best, worst = (math.inf, start), 0.0  # of the negative returns
 
     def negative_return(flat: np.ndarray) -> tuple[float, np.ndarray]:
-        nonlocal worst
-        torch.nn.utils.vector_to_parameters(torch.from_numpy(flat).to(parameters[0]), parameters)
-        try:
-            expected = path.expected_return(policy)
-        except FactorisationError:
-            expected = None
-        if expected is not None and not expected.requires_grad:
-            raise NotDifferentiableError(
-                "no gradient comes through the reward: it must follow from its arguments by differentiable operations "
-                "of PyTorch"
-            )
-        if expected is not None and expected.isfinite():
-            gradients = torch.autograd.grad(-expected, parameters, materialize_grads=True, allow_unused=True)
-            gradient = torch.nn.utils.parameters_to_vector(gradients)
-            if gradient.isfinite().all():
-                worst = max(worst, -expected.item())
-                return -expected.item(), gradient.cpu().numpy()
-        return (worst if math.isfinite(worst) else 0.0) + 1.0, np.zeros_like(flat)
+        nonlocal best, worst
+        _take(flat, parameters)
+        found = _value_and_slope(policy, path, parameters)
+        if found is None:
+            return worst + 1.0, np.zeros_like(flat)
+        best, worst = min(best, (found[0], flat.copy()), key=lambda seen: seen[0]), max(worst, found[0])
+        return found
 
-    start = torch.nn.utils.parameters_to_vector(parameters).detach().cpu().numpy().copy()
     with torch.enable_grad():
-        found = minimize(
-            negative_return, start, jac=True, method="L-BFGS-B", options={"maxiter": max_iterations}
+        found = minimize(negative_return, start, jac=True, method="L-BFGS-B", options={"maxiter": max_iterations})
+    _take(best[1], parameters)  # a line search that fails ends elsewhere
+    return {"imagined_return": -best[0], "search_iterations": float(found.nit)}
+
+
+def _take(flat: np.ndarray, parameters: list[torch.nn.Parameter]) -> None:
+    torch.nn.utils.vector_to_parameters(torch.from_numpy(flat).to(parameters[0]), parameters)
+
+
+def _value_and_slope(
+    policy: SquashedPolicy, path: BeliefPath, parameters: list[torch.nn.Parameter]
+) -> tuple[float, np.ndarray] | None:
+    """The negative expected return and its gradient; None where one of them is not finite."""
+    try:
+        expected = path.expected_return(policy)
+    except FactorisationError:
+        return None
+    if not expected.requires_grad:
+        raise NotDifferentiableError(
+            "no gradient comes through the reward: it must follow from its arguments by differentiable operations of "
+            "PyTorch"
         )
-    torch.nn.utils.vector_to_parameters(torch.from_numpy(found.x).to(parameters[0]), parameters)
-    return {"imagined_return": -float(found.fun), "search_iterations": float(found.nit)}
+    gradients = torch.autograd.grad(-expected, parameters, materialize_grads=True, allow_unused=True)
+    gradient = torch.nn.utils.parameters_to_vector(gradients)
+    if not (expected.isfinite() and gradient.isfinite().all()):
+        return None
+    return -expected.item(), gradient.cpu().numpy()

@@ -93,7 +93,7 @@ class SquashedPolicy(torch.nn.Module):
         raise NotImplementedError
 
     def unsquashed_moments(self, mean: Float[Tensor, "K F"], covariance: Float[Tensor, "K F F"]) -> ActionMoments:
-        """Moments of `unsquashed` at Gaussian features."""
+        """Moments of `unsquashed` at Gaussian features x; in the place of the cross-covariance V, "K F A"."""
         raise NotImplementedError
 
     def forward(self, observation: Float[Tensor, "n S"], keep: Float[Tensor, "n C"] | None = None) -> Tensor:
@@ -117,7 +117,7 @@ class SquashedPolicy(torch.nn.Module):
         scale = self.get_buffer("std")
         centred = (encoded.mean - self.get_buffer("mean")) / scale
         u = self.unsquashed_moments(centred, encoded.covariance / (scale.unsqueeze(-1) * scale))
-        to_state = (encoded.cross / scale) @ u.cross  # u.cross is V here
+        to_state = (encoded.cross / scale) @ u.cross
         return self._squashed(u, mean, covariance, to_state)
 
     def _squashed(self, u: ActionMoments, mean: Tensor, covariance: Tensor, to_state: Tensor) -> ActionMoments:
@@ -145,16 +145,16 @@ class LinearPolicy(SquashedPolicy):
 
     def __init__(self, fed: Fed, action_size: int, squash: SquashName):
         super().__init__(fed, action_size, squash)
-        options = {"dtype": torch.float32, "device": "cpu"}
-        self.weight = torch.nn.Parameter(torch.zeros(len(fed.mean), action_size, **options))
-        self.bias = torch.nn.Parameter(torch.zeros(action_size, **options))
+        self.weight = torch.nn.Parameter(fed.mean.new_zeros(len(fed.mean), action_size))
+        self.bias = torch.nn.Parameter(fed.mean.new_zeros(action_size))
 
     def unsquashed(self, x: Float[Tensor, "n F"], keep: Float[Tensor, "n C"] | None = None) -> Float[Tensor, "n A"]:
         return x @ self.weight + self.bias
 
     def unsquashed_moments(self, mean: Float[Tensor, "K F"], covariance: Float[Tensor, "K F F"]) -> ActionMoments:
         weight = self.weight
-        return ActionMoments(mean @ weight + self.bias, weight.mT @ covariance @ weight, weight.expand(len(mean), -1, -1))
+        gain = weight.expand(len(mean), -1, -1)
+        return ActionMoments(mean @ weight + self.bias, weight.mT @ covariance @ weight, gain)
 
 
 class RBFPolicy(SquashedPolicy):
