@@ -35,6 +35,10 @@ TINIER = (
         "max_training_iterations": 2,
         "num_chains": 2,
         "imagined_timesteps": 100,
+        "first_search_steps": 2,
+        "search_steps": 1,
+        "search_horizon": 3,
+        "max_search_iterations": 1,
     }
 )
 NEEDS = re.compile(r"# (needs .*)\n")

@@ -62,7 +62,7 @@ class PolicyGradient(TD3):
             device=device, verbose=verbose,
         )  # fmt: skip
         self._first_learning_rate = learning_rate
-        self._paths = Paths(env, horizon, num_paths, action_noise)
+        self._paths = Paths(env, horizon, num_paths, action_noise, GOES_ON)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_paths", "_first_learning_rate"]
