@@ -303,3 +303,10 @@ def test_an_agent_without_a_reward_has_no_worlds(tmp_path, learned):
         ).episode_steps
         == 200
     )
+
+
+def test_worlds_without_limits_end_only_where_nothing_is_finite(learned):
+    limited, free = (ImaginedVecEnv.of(learned, 1, is_limited=is_limited) for is_limited in (True, False))
+    far = torch.full((1, 2), 1e6)
+    assert limited.left(far).all() and not free.left(far).any()
+    assert free.left(torch.full((1, 2), torch.nan)).all()
