@@ -12,13 +12,14 @@ INSTALLED := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo docs docs-links test fault-test mutation-test lint clean
+.PHONY: help install demo docs docs-links wheel test fault-test mutation-test lint clean
 
 help:
 	@echo "make install   set up .venv with the package and everything its development needs"
 	@echo "make demo      train on ModCartPole-v0 for a few minutes; results in demo/"
 	@echo "make docs      the documentation as a site, in build/docs; a warning is an error"
 	@echo "make docs-links  are the links to other sites alive? (needs the network)"
+	@echo "make wheel     a wheel with compiled code for this system, in dist/"
 	@echo "make test      lint and docs, then the tests (PYTEST_ARGS=... for pytest)"
 	@echo "make fault-test  kill, cut, mutate and soak in full, for more than half an hour; table in benchmarks/results/"
 	@echo "make mutation-test  change the code in many places, one at a time, and see whether a test fails: hours"
@@ -44,6 +45,10 @@ $(INSTALLED): pyproject.toml constraints.txt
 # The defaults, with fewer candidates than the paper has.
 demo: $(INSTALLED)
 	$(BIN)/dgpmpc train ModCartPole-v0 --layers 2 --episodes 6 --seed 0 --out demo --candidates 200
+
+wheel: $(INSTALLED)
+	GYM_DGPMPC_COMPILE=1 $(BIN)/python -m pip wheel --disable-pip-version-check --quiet --no-deps --wheel-dir dist .
+	@ls dist/*.whl
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

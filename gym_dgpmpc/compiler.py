@@ -1,10 +1,14 @@
-"""Builds the package's C++ sources once, with the compiler of the machine that it runs on, and loads them.
+"""Loads the package's C++ sources as libraries: those that a wheel brings, else built once, on the user's machine.
 
-The result is kept in the user's cache folder (`XDG_CACHE_HOME`, by default `~/.cache`), under a name that says which
-source, compiler, flags and processor it was built from and for, and which bytes it holds: a file that does not hold
-them is built anew, for loading it may kill the process. Where that folder cannot be used, a temporary one can. Used by
-`dynamics/deep_gp/compiled_rollout.py` and `inference/compiled_layers.py`; without a compiler the package works all the
-same, only slower. Compiled code is called through `in_threads`.
+A released wheel brings each source for several levels of processors (`LEVELS`), of which the best is loaded that runs
+here. Without one, as in a clone, the compiler of the machine builds the source. The result is kept in the user's cache
+folder (`XDG_CACHE_HOME`, by default `~/.cache`), under a name that says which source, compiler, flags and processor it
+was built from and for, and which bytes it holds: a file that does not hold them is built anew, for loading it may kill
+the process. Where that folder cannot be used, a temporary one can. Used by `dynamics/deep_gp/compiled_rollout.py` and
+`inference/compiled_layers.py`; without a compiler the package works all the same, only slower. Compiled code is called
+through `in_threads`.
+
+`hatch_build.py` runs this file by itself when a wheel is built, where neither PyTorch nor this package is installed.
 """
 
 import atexit
@@ -12,18 +16,42 @@ import ctypes
 import functools
 import hashlib
 import os
+import platform
 import secrets
 import shutil
 import subprocess
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 
-FLAGS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
+SOURCES: Mapping[str, tuple[str, ...]] = {
+    "dynamics/deep_gp/native/rollout.cpp": ("-ffp-contract=off",),
+    "inference/native/layers.cpp": (),
+}
+"""The C++ of the package, with the compiler's flags that each needs beside `FLAGS`."""
+
+FLAGS = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
+NATIVE = ("-march=native",)
+"""For a library that is built where it runs."""
+
+LEVELS: Mapping[str, tuple[str, ...]] = (
+    {
+        "AVX512": ("-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mfma"),
+        "AVX2": ("-mavx2", "-mfma"),
+        "DEFAULT": (),
+    }
+    if platform.machine().lower() in ("x86_64", "amd64")
+    else {"DEFAULT": ()}
+)
+"""What a wheel's libraries may ask of this kind of processor, the most first, by PyTorch's names; on ARM it is NEON."""
+
+PREBUILT = "prebuilt"
+"""Folder of the package with a wheel's libraries."""
+
 COMPILERS = ("c++", "g++", "clang++")
 BUILD_TIMEOUT = 120.0
 """Seconds after which a compiler is taken to hang."""
@@ -40,9 +68,11 @@ def load(source: str, *flags: str) -> ctypes.CDLL | None:
     Args:
         flags: of the compiler, beside `FLAGS`.
     """
-    path = Path(source)
+    path, package = Path(source), files("gym_dgpmpc")
+    content = package.joinpath(*path.parts).read_bytes()
     try:
-        return _load(path.stem, files("gym_dgpmpc").joinpath(*path.parts).read_bytes(), flags)
+        brought = _load_prebuilt(Path(str(package.joinpath(PREBUILT))), path.stem, content, flags)
+        return _load(path.stem, content, flags) if brought is None else brought
     except (CompilerError, OSError, subprocess.SubprocessError) as error:
         warn_once(f"{error}. Install a C++ compiler (g++ or clang++), or name one in the environment variable CXX")
         return None
@@ -56,6 +86,27 @@ def warn_once(reason: str) -> None:
         "silences this warning",
         stacklevel=3,
     )
+
+
+def build_for_wheel(package: Path, folder: Path) -> list[Path]:
+    """Build all of `SOURCES` for all of `LEVELS`, at once, into an empty folder.
+
+    Args:
+        package: the folder of this package's source.
+
+    Raises:
+        CompilerError, OSError, subprocess.SubprocessError: one cannot be built.
+    """
+    compiler = find_compiler()
+
+    def build(wanted: tuple[str, str]) -> Path:
+        source, level = wanted
+        content, flags = (package / source).read_bytes(), (*FLAGS, *SOURCES[source], *LEVELS[level])
+        library = _build([*compiler, *flags, "-x", "c++", "-"], content)
+        return _keep(folder, _prebuilt_stem(Path(source).stem, level, content, flags), library)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(build, [(source, level) for source in SOURCES for level in LEVELS]))
 
 
 def in_threads(call: Callable[[int, int], int], ranges: Sequence[tuple[int, int]]) -> int:
@@ -106,6 +157,29 @@ if hasattr(os, "register_at_fork"):  # a forked child inherits the pools, but no
     os.register_at_fork(after_in_child=_threads.cache_clear)
 
 
+def _load_prebuilt(folder: Path, name: str, source: bytes, flags: Sequence[str]) -> ctypes.CDLL | None:
+    """The best library of a wheel that this processor runs, if it is of this very source and whole."""
+    if not folder.is_dir():
+        return None
+    import torch  # not where wheels are built
+
+    levels = list(LEVELS)
+    capability = torch.backends.cpu.get_cpu_capability()
+    first = levels.index(capability) if capability in levels else len(levels) - 1
+    for level in levels[first:]:
+        stem = _prebuilt_stem(name, level, source, (*FLAGS, *flags, *LEVELS[level]))
+        for library in folder.glob(f"{stem}-*.so"):
+            with suppress(OSError):
+                if library.name == _file_name(stem, library.read_bytes()):
+                    return ctypes.CDLL(str(library))
+    return None
+
+
+def _prebuilt_stem(name: str, level: str, source: bytes, flags: Sequence[str]) -> str:
+    """Says what a wheel's library was built from and for."""
+    return f"{name}-{level}-{hashlib.sha256(b'%b %b' % (source, ' '.join(flags).encode())).hexdigest()[:24]}"
+
+
 def _load(name: str, source: bytes, flags: Sequence[str]) -> ctypes.CDLL:
     """The library: the one that is kept, else a new one.
 
@@ -113,7 +187,7 @@ def _load(name: str, source: bytes, flags: Sequence[str]) -> ctypes.CDLL:
         CompilerError, subprocess.SubprocessError: it cannot be built.
         OSError: nowhere can it be written and loaded from.
     """
-    command = [*find_compiler(), *FLAGS, *flags, "-x", "c++", "-"]
+    command = [*find_compiler(), *FLAGS, *NATIVE, *flags, "-x", "c++", "-"]
     # All that the compiler predefines with these flags: its version and the processor's instructions among them.
     described = _run([*command, "-dM", "-E"], b"")
     digest = hashlib.sha256(b"\0".join([source, " ".join(command).encode(), described])).hexdigest()

@@ -204,6 +204,63 @@ def test_a_compiler_that_writes_nothing_is_named(monkeypatch):
         assert compiler.load(SOURCE) is None
 
 
+@pytest.fixture
+def wheel(monkeypatch, sources):
+    """The folder of a wheel's libraries, which say their level; no compiler helps out afterwards."""
+    (sources / SOURCE).write_text(
+        "#if defined(__AVX512F__)\n#define L 512\n#elif defined(__AVX2__)\n#define L 2\n#else\n#define L 0\n#endif\n"
+        'extern "C" int answer() { return L; }'
+    )
+    monkeypatch.setattr(compiler, "SOURCES", {SOURCE: ()})
+    folder = sources / compiler.PREBUILT
+    folder.mkdir()
+    assert len(compiler.build_for_wheel(sources, folder)) == len(compiler.LEVELS)
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    return folder
+
+
+needs_levels = pytest.mark.skipif("AVX512" not in compiler.LEVELS, reason="this kind of processor has one level")
+
+
+@needs_compiler
+@needs_levels
+@pytest.mark.parametrize(("capability", "answer"), [("DEFAULT", 0), ("AVX2", 2), ("AVX512", 512), ("SVE256", 0)])
+def test_of_a_wheel_the_best_library_is_loaded_that_runs_here(monkeypatch, wheel, tmp_path, capability, answer):
+    if capability == "AVX512" and torch.backends.cpu.get_cpu_capability() != "AVX512":
+        pytest.skip("this processor has no AVX512")
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    assert compiler.load(SOURCE).answer() == answer
+    assert not (tmp_path / "gym_dgpmpc").exists()  # nothing was built
+
+
+@needs_compiler
+def test_a_wheels_library_of_another_source_or_of_other_flags_is_not_used(monkeypatch, wheel, sources):
+    assert compiler.load(SOURCE) is not None
+    compiler.load.cache_clear()
+    with pytest.warns(UserWarning, match="no-such-compiler"):
+        assert compiler.load(SOURCE, "-DOTHER") is None
+    (sources / SOURCE).write_text('extern "C" int answer() { return 43; }')
+    compiler.load.cache_clear()
+    compiler.warn_once.cache_clear()
+    with pytest.warns(UserWarning, match="no-such-compiler"):
+        assert compiler.load(SOURCE) is None
+
+
+@needs_compiler
+def test_a_damaged_library_of_a_wheel_is_left_alone(wheel):
+    for library in wheel.iterdir():
+        library.write_bytes(library.read_bytes()[:100])
+    with pytest.warns(UserWarning, match="no-such-compiler"):
+        assert compiler.load(SOURCE) is None
+    assert len(list(wheel.iterdir())) == len(compiler.LEVELS)
+
+
+def test_the_sources_of_a_wheel_are_those_that_are_loaded():
+    assert set(compiler.SOURCES) == {compiled_rollout.SOURCE, compiled_layers.SOURCE}
+    for source in compiler.SOURCES:
+        assert (Path(compiler.__file__).parent / source).is_file()
+
+
 def test_memory_that_cannot_be_had_is_an_error(monkeypatch):
     """The compiled code says by its result that it could not allocate; nothing is then returned as if computed."""
 

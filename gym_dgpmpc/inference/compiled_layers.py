@@ -246,7 +246,7 @@ def _in_shares(count: int, name: str, *arguments: object) -> int:
 
 @cache
 def _library() -> ctypes.CDLL | None:
-    library = compiler.load(SOURCE)
+    library = compiler.load(SOURCE, *compiler.SOURCES[SOURCE])
     if library is not None:
         for name, arguments in _ARGUMENTS.items():
             getattr(library, name).argtypes = (ctypes.POINTER(_Layer), *arguments, _Count, _Count)

@@ -252,7 +252,7 @@ class CompiledRollout:
 
 @cache
 def _library() -> ctypes.CDLL | None:
-    library = compiler.load(SOURCE, "-ffp-contract=off")
+    library = compiler.load(SOURCE, *compiler.SOURCES[SOURCE])
     if library is not None:
         library.rollout.argtypes = (ctypes.POINTER(_Task), *(ctypes.c_int64,) * 3)
         library.kernel_number.argtypes = (ctypes.c_char_p,)
