@@ -1,8 +1,10 @@
 """A policy from the model's worlds: trained in them by an algorithm of Stable-Baselines3, chosen by held-out ones.
 
 What is learned in imagination jumps up and down, and an algorithm learns to exploit the worlds that it lives in. So
-the policy is tried, now and then, in worlds that it never learns in, always the same ones from the same starts; the
-best one is kept, and training ends when none has become better for a while. The real environment is never asked.
+what is used is the average of the policies along the way, in their parameters (Izmailov et al. 2018, "Averaging Weights
+Leads to Wider Optima and Better Generalization"; here a moving one). It is tried, now and then, in worlds that it never
+learns in, always the same ones from the same starts; the best one is kept, and training ends when none has become
+better for a while. The real environment is never asked.
 """
 
 import copy
@@ -28,6 +30,9 @@ from gym_dgpmpc.randomness import derive_seed
 
 LEARNING, CHOOSING, REPORTING = range(3)
 """The substreams of a seed: worlds to learn in, to choose the policy by, and to say what it earns."""
+
+LATEST = 0.3
+"""Share of the latest policy in the moving average, which is taken at the trials."""
 
 
 class Trial(NamedTuple):
@@ -71,7 +76,9 @@ class ImaginedPolicy(NamedTuple):
 
 
 class ChooseByWorlds(BaseCallback):
-    """Tries the policy every ``every`` steps, keeps the best one, and ends training when ``patience`` brought nothing.
+    """Tries the averaged policy every ``every`` steps, keeps the best, ends training when ``patience`` brought nothing.
+
+    The algorithm goes on learning from its own, latest policy.
 
     Args:
         worlds: held out.
@@ -96,7 +103,8 @@ class ChooseByWorlds(BaseCallback):
         self._on_trial, self._on_progress = on_trial, on_progress
         self.trials: list[Trial] = []
         self.best: Trial | None = None
-        self._parameters: dict[str, Any] = {}
+        self._average: dict[str, Tensor] = {}
+        self._parameters: dict[str, Tensor] = {}
         self._next = every
 
     def _on_step(self) -> bool:
@@ -108,11 +116,16 @@ class ChooseByWorlds(BaseCallback):
         return self.try_policy()
 
     def try_policy(self) -> bool:
-        """Try the present policy; returns whether it is worth to go on."""
+        """Try the average with the present policy in it; returns whether it is worth to go on."""
+        policy = self.model.policy
+        own = copy.deepcopy(policy.state_dict())
+        self._average = moved(self._average, own, LATEST)
+        policy.load_state_dict(self._average)
         trial = Trial.of(self.model, self._worlds, self._seed, self.num_timesteps)
+        policy.load_state_dict(own)
         self.trials.append(trial)
         if math.isfinite(trial.mean_return) and (self.best is None or trial.mean_return > self.best.mean_return):
-            self.best, self._parameters = trial, copy.deepcopy(self.model.policy.state_dict())
+            self.best, self._parameters = trial, self._average
         self.logger.record("imagination/held_out_return", trial.mean_return)
         if self._on_trial is not None:
             self._on_trial(trial)
@@ -132,6 +145,15 @@ class ChooseByWorlds(BaseCallback):
             )
         self.model.policy.load_state_dict(self._parameters)
         return self.best
+
+
+def moved(average: Mapping[str, Tensor], latest: Mapping[str, Tensor], share: float) -> dict[str, Tensor]:
+    """A moving average with this share of the latest parameters, which are the first one; counters are the latest."""
+    if not average:
+        return dict(latest)
+    return {
+        name: average[name].lerp(value, share) if value.is_floating_point() else value for name, value in latest.items()
+    }
 
 
 def learned_parameters(model: BaseAlgorithm) -> dict[str, Tensor]:

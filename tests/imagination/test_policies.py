@@ -11,13 +11,14 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import DDPG, SAC
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
 
 from gym_dgpmpc.errors import TrainingError
 from gym_dgpmpc.imagination import policies
 from gym_dgpmpc.imagination.algorithms import algorithm_class, budget_of, suited_settings
 from gym_dgpmpc.imagination.features import EncodedObservation
 from gym_dgpmpc.imagination.global_randomness import lent_randomness
-from gym_dgpmpc.imagination.policies import ChooseByWorlds, Trial, imagine, learned_parameters, take_over
+from gym_dgpmpc.imagination.policies import ChooseByWorlds, Trial, imagine, learned_parameters, moved, take_over
 from gym_dgpmpc.imagination.worlds import ImaginedVecEnv
 from tests.agents.point_mass import LENGTH, KnownPointMass, agent
 
@@ -76,6 +77,40 @@ def test_pythons_own_random_state_is_put_back_too():
         random.seed(5)
         raise RuntimeError
     assert random.getstate() == before
+
+
+def test_the_average_moves_and_counters_do_not():
+    """After x, y and z with a share of a quarter it is (x 3/4 + y 1/4) 3/4 + z 1/4."""
+    average: dict[str, torch.Tensor] = {}
+    for number in (8.0, 16.0, 40.0):
+        average = moved(average, {"w": torch.tensor([number]), "steps": torch.tensor(int(number))}, 0.25)
+    assert average["w"].tolist() == [17.5] and average["steps"].item() == 40
+
+
+def test_what_is_tried_and_kept_is_the_average_and_what_learns_is_not(learned, monkeypatch):
+    def first_bias():
+        return next(value for name, value in model.policy.named_parameters() if name.endswith("bias"))
+
+    tried, returns = [], iter([1.0, 3.0, 2.0])
+
+    def note(model, worlds, seed, timesteps):
+        tried.append(first_bias()[0].item())
+        return Trial(timesteps, next(returns), 0.0)
+
+    monkeypatch.setattr(Trial, "of", note)
+    worlds = ImaginedVecEnv.of(learned, 4, episode_steps=LENGTH, seed=0)
+    model = SAC("MlpPolicy", worlds, device="cpu")
+    chosen = ChooseByWorlds(worlds, 0, 100, 50, None, None)
+    chosen.init_callback(model)
+    model.set_logger(configure(None, []))
+    for number in (1.0, 2.0, 3.0):
+        first_bias().data.fill_(number)
+        chosen.try_policy()
+        assert (first_bias() == number).all()  # it goes on from its own
+    share = policies.LATEST
+    second = 1.0 + share
+    assert tried == pytest.approx([1.0, second, second + share * (3.0 - second)], rel=1e-6)
+    assert chosen.restore_best().mean_return == 3.0 and first_bias()[0].item() == tried[1]
 
 
 def test_training_ends_when_nothing_gets_better(learned, monkeypatch):
