@@ -260,6 +260,7 @@ ALL_METHODS: tuple[Method, ...] = (
         for draw in ("MM", "DS")
         for name, noise in (("", False), (" with noise", True))
     ),
+    PlanningMethod("GP-MPC", GPMPCAgent, _of(presets.COMPARISON_GP), {"draw": "AMM", "planner": "gradient"}),
     PlanningMethod("DGP L=2 and PETS", MixtureMPCAgent, _mixed, {"ensemble_half_precision": True}),
     PlanningMethod("MC-PILCO", MCPILCOAgent, _of(presets.POLICY_SEARCH)),
     PlanningMethod(

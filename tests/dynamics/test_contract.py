@@ -193,7 +193,7 @@ def test_a_double_precision_draw_follows_states_of_either_precision(name, dtype)
     assert torch.equal(states[1], after) and states.isfinite().all()
 
 
-WITHOUT_GRADIENTS = ["truth", "sparse-AMM"]
+WITHOUT_GRADIENTS = ["truth"]
 
 
 def weighted(states):
@@ -218,8 +218,9 @@ def by_a_policy(sampler, start, gain):
 def test_gradients_are_those_of_the_values(name, value_of):
     """By the start, the actions and a policy's parameters, against differences over draws of the same random numbers.
 
-    Networks compute in single precision, whose rounding a wider difference has to stay above. Its own error falls as
-    the fourth power of the width.
+    Networks compute in single precision, and the factor of a covariance whose entries nearly depend on each other loses
+    half of its digits: such rounding a wider difference has to stay above. Its own error falls as the fourth power of
+    the width.
     """
     model = CASES[name].make(dtype=torch.float64)
     model.load_state_dict(trained_state(CASES[name].family))
@@ -239,6 +240,8 @@ def test_gradients_are_those_of_the_values(name, value_of):
     )
     assert recorded.item() == pytest.approx(value(0.0).item(), rel=1e-12), "a recorded gradient changes no value"
     width, rounding = (2e-2, 1e-3) if CASES[name].family == "ensemble" else (3e-4, 1e-6)
+    if name == "sparse-AMM":
+        width, rounding = 1e-3, 1e-5
     near, far = ((value(shift) - value(-shift)) / (2 * shift) for shift in (width, 2 * width))
     known = (4 * near - far) / 3
     assert abs(found - known) <= rounding * (1 + abs(known)), (found, known, near, far)

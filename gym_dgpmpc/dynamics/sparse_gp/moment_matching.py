@@ -3,7 +3,9 @@
 The propagation of PILCO (Deisenroth and Rasmussen 2011), with full covariances, and with the sines and cosines of
 angles matched exactly too. Between two steps the particles of a candidate stand for its Gaussian: they are placed so
 that their mean and their (population) covariance are exactly its own, and the next step reads those off again. So a
-`TransitionSampler` needs no memory, and the reward is averaged over points spread like the belief.
+`TransitionSampler` needs no memory, and the reward is averaged over points spread like the belief. With a planner
+that climbs by gradients this is GP-MPC (Kamthe and Deisenroth 2018, "Data-Efficient Reinforcement Learning with
+Probabilistic Model Predictive Control").
 """
 
 import math
@@ -17,7 +19,11 @@ from gym_dgpmpc.autograd import refuse_if_asked
 from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.data.normaliser import Normaliser
 from gym_dgpmpc.dynamics.noise import ObservationNoise
+from gym_dgpmpc.gp.linalg import cholesky
 from gym_dgpmpc.gp.moments import Predictor, predicted_moments
+
+ROOT_JITTER = 1e-12
+"""Of a variance: what rounding leaves of correlations that are one."""
 
 
 class Encoded(NamedTuple):
@@ -87,7 +93,7 @@ class MomentMatchingSampler:
             observed, from which the noise's is taken off before a step; at the first step, where nothing is spread yet,
             it is added.
 
-    It has no gradients, and refuses where one is asked for (`NotDifferentiableError`).
+    It has gradients but for those through a blur, and refuses these (`NotDifferentiableError`).
 
     Raises:
         ValueError: there are too few particles.
@@ -119,7 +125,8 @@ class MomentMatchingSampler:
     def __call__(
         self, observation: Float[Tensor, "P K S"], action: Float[Tensor, "*p K A"], step: int
     ) -> Float[Tensor, "P K S"]:
-        refuse_if_asked(self, observation, action)  # factors of equal eigenvalues have no derivative
+        if self._blur is not None:
+            refuse_if_asked(self, observation, action)  # factors of equal eigenvalues have no derivative
         # Factorisations are batched over the candidates, and fail for all if one of them is not finite.
         actions = action.expand(len(observation), -1, -1)
         points = torch.cat([part.to(self._frame.dtype) for part in (observation, actions)], -1)
@@ -133,9 +140,7 @@ class MomentMatchingSampler:
         mean, covariance = self.propagate(mean, covariance)
         if self._blur is not None:
             covariance = covariance + torch.diag(self._blur.std.square())
-        values, vectors = torch.linalg.eigh(covariance)
-        root = vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)  # rounding leaves values below zero
-        spread = torch.einsum("ps,kts->pkt", self._frame, root)
+        spread = torch.einsum("ps,kts->pkt", self._frame, root_of(covariance))
         return (mean + spread).masked_fill(lost, math.nan).to(observation.dtype)
 
     def _fed(
@@ -183,6 +188,20 @@ class MomentMatchingSampler:
         rows = torch.tensor(predicted, dtype=torch.int64, device=mean.device)
         next_covariance[:, rows.unsqueeze(-1), rows] += change
         return next_mean, 0.5 * (next_covariance + next_covariance.mT)
+
+
+def root_of(covariance: Float[Tensor, "K S S"]) -> Float[Tensor, "K S S"]:
+    """Lower factors of positive semi-definite matrices, differentiable; rows of zeros where nothing varies.
+
+    The correlations are factorised, so that what varies little keeps its digits beside what varies much.
+    """
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    varies = variance > 0
+    std = torch.where(varies, variance, 1.0).sqrt()
+    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
+    correlation = covariance / (std.unsqueeze(-1) * std.unsqueeze(-2))
+    correlation = torch.where(varies.unsqueeze(-1) & varies.unsqueeze(-2), correlation, eye)
+    return cholesky(correlation, jitter=ROOT_JITTER) * torch.where(varies, std, 0.0).unsqueeze(-1)
 
 
 def _without(covariance: Float[Tensor, "K S S"], part: Float[Tensor, "S S"]) -> Float[Tensor, "K S S"]:

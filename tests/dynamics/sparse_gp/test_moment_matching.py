@@ -7,7 +7,8 @@ import torch
 from gym_dgpmpc.data.encoding import Encoder
 from gym_dgpmpc.dynamics.noise import ObservationNoise
 from gym_dgpmpc.dynamics.sparse_gp.model import SparseGPDynamics
-from gym_dgpmpc.dynamics.sparse_gp.moment_matching import encoded_moments, orthonormal_frame
+from gym_dgpmpc.dynamics.sparse_gp.moment_matching import encoded_moments, orthonormal_frame, root_of
+from gym_dgpmpc.errors import NotDifferentiableError
 from gym_dgpmpc.types import ObservationSpec, Transitions
 from tests.oracles.models import normal, seeded
 
@@ -154,3 +155,28 @@ def test_frames_have_mean_zero_and_unit_covariance(num_particles, size):
 def test_too_few_particles_are_an_error():
     with pytest.raises(ValueError, match=r"AMM .*\b5 particles.*\b4$"):
         trained().draw(4, 1, seeded())
+
+
+def test_roots_keep_small_variances_and_what_does_not_vary():
+    """Standard deviations of 1e-6 and 1e3 side by side, one of zero, and two numbers that are the same one."""
+    std = torch.tensor([1e-6, 0.0, 1e3, 2.0], dtype=torch.float64)
+    correlation = torch.eye(4, dtype=torch.float64)
+    correlation[0, 2] = correlation[2, 0] = 0.9
+    several = torch.stack([correlation, torch.ones_like(correlation)]) * std.unsqueeze(-1) * std
+    root = root_of(several)
+    found = (root @ root.mT - several) / std.clamp_min(1e-9).unsqueeze(-1) / std.clamp_min(1e-9)
+    assert found.abs().max() < 1e-11 and not root[:, 1].any() and not root.triu(1).any()
+
+
+def test_a_root_has_a_derivative_where_something_does_not_vary():
+    """Of l = std along the diagonal: d(std) / d(variance) = 1 / (2 std), and nothing at a variance of zero."""
+    variance = torch.tensor([4.0, 0.0, 9.0], dtype=torch.float64, requires_grad=True)
+    root_of(torch.diag_embed(variance.unsqueeze(0))).sum().backward()
+    torch.testing.assert_close(variance.grad, torch.tensor([0.25, 0.0, 1 / 6], dtype=torch.float64), rtol=1e-9, atol=0)
+
+
+def test_gradients_through_a_blur_are_refused():
+    sampler = trained().draw(10, 1, seeded())
+    sampler._blur = ObservationNoise(*(torch.full((4,), 0.1, dtype=torch.float64) for _ in range(3)))
+    with pytest.raises(NotDifferentiableError, match=r"MomentMatchingSampler has no gradients.*split_noise"):
+        sampler(torch.zeros(10, 2, 4), torch.zeros(2, 1, requires_grad=True), 0)
