@@ -15,10 +15,11 @@ import numpy as np
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.calibration.scores import forecast, scores
+from benchmarks.calibration.forecasts import forecast
 from benchmarks.rows import Row, measure_missing
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
+from gym_dgpmpc.dynamics.scores import scores
 from gym_dgpmpc.dynamics.sparse_gp.model import SparseGPDynamics
 from gym_dgpmpc.types import DynamicsModel, Transitions
 

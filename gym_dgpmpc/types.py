@@ -9,7 +9,7 @@ the shape annotations: N transitions, S observation size, A action size, K candi
 P particles, H horizon.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import index
 from types import MappingProxyType
@@ -172,6 +172,28 @@ class ReportsDiagnostics(Protocol):
 
     def diagnostics(self) -> Mapping[str, float]:
         """Numbers by the names under which `fit` reports them; none before the first fit."""
+        ...
+
+
+class Scales(NamedTuple):
+    """What a Gaussian process makes of its inputs and targets, of C chains, without units.
+
+    Attributes:
+        lengthscales: of each layer, in spreads of its D inputs, in the order of `Encoder.input_names`: the longer, the
+            less that input matters.
+        noise_std: of the T predicted numbers, in spreads of what is predicted: near 1 nothing of it is explained.
+    """
+
+    lengthscales: Sequence[Float[Tensor, "C D"]]
+    noise_std: Float[Tensor, "C T"]
+
+
+@runtime_checkable
+class ReportsScales(Protocol):
+    """A `DynamicsModel` with lengthscales and noise to show; other models need not."""
+
+    def scales(self) -> Scales | None:
+        """Those of the last fit; None before the first."""
         ...
 
 

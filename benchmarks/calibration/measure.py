@@ -12,12 +12,13 @@ from typing import Any
 import torch
 
 from benchmarks.calibration.episodes import DATA, SMOOTH, TASKS, WHITE, load, observation_spec, spread
+from benchmarks.calibration.forecasts import forecast
 from benchmarks.calibration.models import Make
-from benchmarks.calibration.scores import forecast, scores
 from gym_dgpmpc.agents.presets import DEEP_GP, NETWORKS, for_mixture
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
 from gym_dgpmpc.dynamics.mixture.model import MixtureDynamics
+from gym_dgpmpc.dynamics.scores import scores
 
 HORIZONS = {"cartpole": (1, 10, 20), "pendulum": (1, 10, 20), "reacher": (1, 10, 20), "cheetah": (1, 10, 20, 40)}
 

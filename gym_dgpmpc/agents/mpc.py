@@ -19,7 +19,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
@@ -39,6 +39,7 @@ from gym_dgpmpc.agents.composition import (
 )
 from gym_dgpmpc.agents.episode import EpisodeRecord
 from gym_dgpmpc.agents.exploration import ExplorationName, Explorer, FirstController
+from gym_dgpmpc.agents.forecasting import forecast
 from gym_dgpmpc.agents.logs import Logs
 from gym_dgpmpc.agents.policy import MPCPolicy
 from gym_dgpmpc.agents.progress import Progress, RandomStreams
@@ -48,7 +49,7 @@ from gym_dgpmpc.checkpoints.folder import RunCheckpoints
 from gym_dgpmpc.checkpoints.format import CheckpointPath, write_checkpoint
 from gym_dgpmpc.checkpoints.interface import StateOf
 from gym_dgpmpc.checkpoints.restore import load_agent
-from gym_dgpmpc.checkpoints.safeguard import Guard, safeguard
+from gym_dgpmpc.checkpoints.safeguard import Guard, callbacks_before, safeguard
 from gym_dgpmpc.checks import check_counts
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
@@ -591,7 +592,7 @@ class MPCAgent(BaseAlgorithm):
             self._has_described = True
         # Callbacks come last, for they may use the logger as soon as they are given the agent; the guard's after the
         # user's, so that a checkpoint holds what they did.
-        return total_timesteps, self._init_callback([*_as_callbacks(callback), guard.callback()])
+        return total_timesteps, self._init_callback(callbacks_before(guard, callback))
 
     def _control(self, total_timesteps: int, callback: BaseCallback, log_interval: int) -> None:
         """Algorithm 2 of the paper, one pass through the loop per control step (of all environments)."""
@@ -844,6 +845,30 @@ class MPCAgent(BaseAlgorithm):
         """
         return self.policy.predict(observation, state, episode_start, deterministic)
 
+    def forecast(self, observation: Any, actions: np.ndarray, num_particles: int = 100, seed: int = 0) -> np.ndarray:
+        """What the model predicts for actions that are given, world by world.
+
+            states = agent.forecast(observation, np.zeros((20, 1)))
+            low, high = np.quantile(states[:, 10], [0.05, 0.95], axis=0)  # of each number, ten steps ahead
+
+        Moves none of the random streams that learning and planning draw from.
+
+        Args:
+            observation: [S], the first state, in the environment's units; or a dict, if the environment's are.
+            actions: [H, A] within the bounds, for any number of steps H.
+            num_particles: P, worlds drawn.
+            seed: of the worlds, with the agent's: the same one gives the same forecast until the model has learned more.
+
+        Returns:
+            The states [P, H + 1, S] in the environment's units, the first of each the observation. They have the fitted
+            noise if plans have it. A model that diverges gives values that are not finite.
+
+        Raises:
+            ValueError: the agent has not learned yet, a shape is another, or an action is out of bounds.
+            EnvironmentDataError: the observation is not finite.
+        """
+        return forecast(self, observation, actions, num_particles, seed)
+
     # --------------------------------------------------------------------------------------------- saving and loading
 
     def save(
@@ -956,10 +981,3 @@ class MPCAgent(BaseAlgorithm):
 
 
 MPCAgent.__signature__ = composed_signature(MPCAgent, MPCAgent.own_settings())  # type: ignore[attr-defined]
-
-
-def _as_callbacks(callback: MaybeCallback) -> list[BaseCallback]:
-    """What `learn` was given, as SB3's callbacks."""
-    if isinstance(callback, list):
-        return callback
-    return [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]

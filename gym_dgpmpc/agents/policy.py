@@ -63,7 +63,7 @@ class MPCPolicy(BasePolicy):
     ) -> tuple[ndarray, PackedPlans]:
         """See `MPCAgent.predict`."""
         controller = self._agent.controller
-        observations, is_batch = self._checked(observation)
+        observations, is_batch = self.checked(observation)
         num_envs, cold = len(observations), controller.cold
         carried = [cold] * num_envs if state is None else unpack(state, cold, num_envs, controller.actions_per_plan)
         starts = np.broadcast_to(False if episode_start is None else episode_start, num_envs)
@@ -98,7 +98,7 @@ class MPCPolicy(BasePolicy):
         actions, _ = self.predict(rows, deterministic=deterministic)
         return torch.from_numpy(actions).to(self._agent.controller.device)
 
-    def _checked(self, observation: Any) -> tuple[ndarray, bool]:
+    def checked(self, observation: Any) -> tuple[ndarray, bool]:
         """Observations [n, S], float32 unless their space is float64, and whether they came with that dimension."""
         if isinstance(observation, tuple):
             raise ValueError(

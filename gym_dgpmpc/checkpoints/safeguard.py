@@ -9,7 +9,8 @@ from types import TracebackType
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
 
 from gym_dgpmpc.checkpoints.collect import collect
 from gym_dgpmpc.checkpoints.event_files import drop_events_after
@@ -219,6 +220,13 @@ class Safeguard:
 
     def _present(self) -> tuple[int, int]:
         return self.agent.num_timesteps, self.agent.num_fitted
+
+
+def callbacks_before(guard: Guard, callback: MaybeCallback) -> list[BaseCallback]:
+    """What `learn` was given, as SB3's callbacks, with the guard's behind them."""
+    given = callback if isinstance(callback, list) else [callback]
+    given = [each if isinstance(each, BaseCallback) else ConvertCallback(each) for each in given]
+    return [*given, guard.callback()]
 
 
 class _AfterEachStep(BaseCallback):

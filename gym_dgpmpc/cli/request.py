@@ -15,7 +15,13 @@ from gym_dgpmpc.settings import refuse_unknown
 
 DEFAULT_EPISODES = 15
 DEFAULT_AGENT = "dgp-mpc"
-DEFAULT_OPTIONS: dict[str, Any] = {"threads": 1, "video": True, "checkpoint_every": None, "formats": [*FORMATS[:1]]}
+DEFAULT_OPTIONS: dict[str, Any] = {
+    "threads": 1,
+    "video": True,
+    "look": False,
+    "checkpoint_every": None,
+    "formats": [*FORMATS[:1]],
+}
 """What is not given, and no folder says; beside ``episodes`` and ``timesteps``, of which one is needed."""
 
 

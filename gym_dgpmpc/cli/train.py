@@ -105,6 +105,15 @@ def train(
             rich_help_panel=RUN,
         ),
     ] = None,
+    look: Annotated[
+        bool | None,
+        typer.Option(
+            "--look/--no-look",
+            help="Log forecasts, coverage, training and planning of each episode for TensorBoard.",
+            show_default="no-look",
+            rich_help_panel=RUN,
+        ),
+    ] = None,
     formats: Annotated[
         list[FigureFormat] | None,
         typer.Option(
@@ -132,6 +141,7 @@ def train(
         "timesteps": timesteps,
         "threads": threads,
         "video": video,
+        "look": look,
         "checkpoint_every": checkpoint_every,
         "formats": [each.value for each in formats] if formats else None,
     }
@@ -211,6 +221,7 @@ def _set_up_run(env: gymnasium.Env, request: Request, overwrite: bool) -> "Train
             checkpoint_every=options["checkpoint_every"],
             title=title_of(settings),
             formats=options["formats"],
+            look=options["look"],
         )
         folder.write_settings(episodes=episodes, timesteps=timesteps, options={"env_id": request.env_id, **options})
     except BaseException:

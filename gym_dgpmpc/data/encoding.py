@@ -6,7 +6,7 @@ are predicted rather than values unless a dimension is absolute, and constant di
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -106,6 +106,12 @@ class Encoder:
             angle = observation[..., self.angles]
             columns += [angle.sin(), angle.cos()]
         return torch.cat([*columns, action], dim=-1)
+
+    def input_names(self, observation: Sequence[str], action: Sequence[str]) -> list[str]:
+        """What each of the D inputs is, by the names of the S numbers of an observation and the A of an action."""
+        angles = [observation[i] for i in self.angles]
+        plain = [observation[i] for i in self.plain]
+        return [*plain, *(f"sin {name}" for name in angles), *(f"cos {name}" for name in angles), *action]
 
     def targets(
         self, observation: Float[Tensor, "*b S"], next_observation: Float[Tensor, "*b S"]

@@ -39,3 +39,28 @@ def split_r_hat(samples: Float[Tensor, "n V"]) -> Float[Tensor, "V"]:
     between = half * halves.mean(1).var(0)
     pooled = (half - 1) / half * within + between / half
     return torch.where(pooled == 0, 1.0, pooled / within).sqrt()
+
+
+def rank_normalised_r_hat(samples: Float[Tensor, "n V"]) -> Float[Tensor, "V"]:
+    """The larger of two split R-hats of each coordinate of one chain: of its ranks, and of its distances' ranks.
+
+    Ranks are made normal scores, Phi^-1((rank - 3/8) / (n + 1/4)), so that heavy tails do not hide a drift; distances are
+    those from the median, so that halves that differ in their spread alone are seen (Vehtari et al. 2021, section 4).
+    Of an odd number of samples the one in the middle is left out.
+
+    Raises:
+        ValueError: fewer than four samples.
+    """
+    half = len(samples) // 2
+    halves = torch.cat([samples[:half], samples[len(samples) - half :]]).double()
+    middle = (halves.median(0).values - (-halves).median(0).values) / 2  # of an even number, the mean of the two
+    return torch.maximum(*(split_r_hat(_normal_scores(each)) for each in (halves, (halves - middle).abs())))
+
+
+def _normal_scores(samples: Float[Tensor, "n V"]) -> Float[Tensor, "n V"]:
+    """What normal samples of these ranks would be; equal samples share their mean rank."""
+    rows = samples.mT.contiguous()
+    ordered = rows.sort(-1).values
+    below, up_to = (torch.searchsorted(ordered, rows, right=right) for right in (False, True))
+    rank = (below + up_to + 1).to(samples.dtype) / 2
+    return torch.special.ndtri((rank - 0.375) / (rows.shape[-1] + 0.25)).mT

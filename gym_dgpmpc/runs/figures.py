@@ -55,6 +55,8 @@ class Forecast(NamedTuple):
     start_step: int
     predicted: Float[ndarray, "H_plus_1 P S"]
     observed: Float[ndarray, "H_plus_1 S"]
+    actions: Float[ndarray, "H A"] | None = None
+    """What was done, to be shown below; None shows nothing."""
 
 
 def plot_learning_curve(
@@ -107,6 +109,13 @@ def plot_prediction_fan(
     title: str,
     step_seconds: float | None = None,
 ) -> None:
+    """Write `prediction_fan` to ``path``: the file or files; their suffix decides the format."""
+    write_figure(prediction_fan(forecasts, labels=labels, title=title, step_seconds=step_seconds), path, dpi=130)
+
+
+def prediction_fan(
+    forecasts: Sequence[Forecast], *, labels: Sequence[str], title: str, step_seconds: float | None = None
+) -> Figure:
     """Draw the particles' 50 % and 90 % bands, their median and a few of their paths, with what happened.
 
     One column per forecast, one row per observation dimension that changed or was predicted to change; each panel
@@ -114,8 +123,7 @@ def plot_prediction_fan(
     average (the values of one forecast are correlated, so single panels scatter widely).
 
     Args:
-        forecasts: at least one, all of the same observation size S.
-        path: the file or files; their suffix decides the format.
+        forecasts: at least one, all of the same observation size S, and all with actions or none.
         labels: S texts with units.
         title: the figure's heading.
         step_seconds: duration of an environment step, if it is known.
@@ -130,24 +138,29 @@ def plot_prediction_fan(
         raise ValueError(f"labels must have {size} texts, one per number of the observation, got {len(labels)}")
     shown = [i for i in range(size) if any(_moves(forecast, i) for forecast in forecasts)][:MAX_DIMENSIONS]
     shown = shown or [0]
-    figure = Figure(figsize=(5.2 * len(forecasts) + 0.8, 1.9 * len(shown) + 1.2), layout="constrained")
-    grid = figure.subplots(len(shown), len(forecasts), squeeze=False, sharex="col", sharey="row")
+    rows = len(shown) + (forecasts[0].actions is not None)
+    figure = Figure(figsize=(5.2 * len(forecasts) + 0.8, 1.9 * rows + 1.2), layout="constrained")
+    grid = figure.subplots(rows, len(forecasts), squeeze=False, sharex="col", sharey="row")
     for column, forecast in enumerate(forecasts):
         for row, dimension in enumerate(shown):
             _draw_fan(grid[row, column], forecast, dimension)
             _limit_to_what_matters(grid[row, 0], forecasts, dimension)
+        if forecast.actions is not None:
+            _draw_actions(grid[-1, column], forecast.start_step, forecast.actions)
         horizon = len(forecast.observed) - 1
         grid[0, column].set_title(f"{horizon} steps ahead from step {forecast.start_step}", fontsize="medium")
         duration = f", 1 step = {step_seconds:g} s" if step_seconds else ""
         grid[-1, column].set_xlabel(f"step of the episode{duration}")
         grid[-1, column].xaxis.set_major_locator(MaxNLocator(integer=True))
+    if rows > len(shown):
+        grid[-1, 0].set_ylabel("actions", fontsize="small")
     for row, dimension in enumerate(shown):
         grid[row, 0].set_ylabel(textwrap.fill(labels[dimension], 26), fontsize="small")
     hidden = f"; {size - len(shown)} of {size} dimensions not shown" if len(shown) < size else ""
     figure.suptitle(title + hidden)
     handles, names = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), fontsize="small")
-    write_figure(figure, path, dpi=130)
+    return figure
 
 
 def write_figure(figure: Figure, path: Paths, *, dpi: int) -> None:
@@ -223,6 +236,16 @@ def _draw_fan(axes: Axes, forecast: Forecast, dimension: int) -> None:
     text = f"{inside} of {len(observed) - 1} inside the {WIDEST:.0%} band"
     box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.5}
     axes.text(0.99, 0.96, text, transform=axes.transAxes, ha="right", va="top", fontsize="x-small", bbox=box)
+    axes.grid(alpha=0.3)
+
+
+def _draw_actions(axes: Axes, start: int, actions: Float[ndarray, "H A"]) -> None:
+    """Each action over the step that it was performed in."""
+    edges = start + np.arange(len(actions) + 1)
+    for index, values in enumerate(actions[:, :MAX_DIMENSIONS].T):
+        axes.stairs(values, edges, baseline=None, label=f"{index}", linewidth=1.2)
+    if actions.shape[1] > 1:
+        axes.legend(loc="upper right", fontsize="xx-small", ncols=6)
     axes.grid(alpha=0.3)
 
 

@@ -1,18 +1,17 @@
 """What a run keeps of its episodes while they happen: the last one with its pictures, and forecasts made in it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-import torch
+from gymnasium.envs.registration import EnvSpec
 from jaxtyping import Float
 from numpy import ndarray
 from stable_baselines3.common.callbacks import BaseCallback
 
 from gym_dgpmpc.agents import MPCAgent
-from gym_dgpmpc.planning.rollout import rollout
-from gym_dgpmpc.randomness import derive_seed
+from gym_dgpmpc.agents.forecasting import draw_worlds, states_along
 from gym_dgpmpc.runs.figures import Forecast
 from gym_dgpmpc.runs.rendering import shrink
 from gym_dgpmpc.tasks.dict_observations import flatten
@@ -51,11 +50,7 @@ class EpisodeRecorder(gymnasium.Wrapper):
         super().__init__(env)
         self.last: Episode | None = None
         self._on_end = on_end
-        # The metadata of a vector environment or of a wrapper may lack the rate.
-        rate = float(env.metadata.get("render_fps") or MAX_FRAMES_PER_SECOND)
-        limit = (env.spec.max_episode_steps if env.spec is not None else None) or MAX_FRAMES
-        self._steps_per_frame = max(1, round(rate / MAX_FRAMES_PER_SECOND), -(-limit // MAX_FRAMES))
-        self._frames_per_second = rate / self._steps_per_frame
+        self._steps_per_frame, self._frames_per_second = frame_rate(env.metadata, env.spec)
         self._observations: list[ndarray] = []
         self._actions: list[ndarray] = []
         self._rewards: list[float] = []
@@ -94,6 +89,15 @@ class EpisodeRecorder(gymnasium.Wrapper):
             self._frames.append(shrink(frame))
 
 
+def frame_rate(metadata: Mapping[str, Any], spec: EnvSpec | None) -> tuple[int, float]:
+    """Steps of an environment between two pictures that are kept, and how many pictures a second that makes."""
+    # The metadata of a vector environment or of a wrapper may lack the rate.
+    rate = float(metadata.get("render_fps") or MAX_FRAMES_PER_SECOND)
+    limit = (spec.max_episode_steps if spec is not None else None) or MAX_FRAMES
+    steps = max(1, round(rate / MAX_FRAMES_PER_SECOND), -(-limit // MAX_FRAMES))
+    return steps, rate / steps
+
+
 class ForecastCallback(BaseCallback):
     """Draws worlds early in each planned episode, and compares them with what happened when it has ended.
 
@@ -124,22 +128,14 @@ class ForecastCallback(BaseCallback):
                 self.forecasts = [self._compare(episode, start) for start in starts]
             self._worlds = {}
         elif self.agent.is_fitted and self.recorder.num_steps in (1, 1 + self.horizon):
-            seed = derive_seed(self.agent.seed, "forecast", self.agent.num_timesteps)
-            generator = torch.Generator(self.agent.device).manual_seed(seed)
-            worlds = self.agent.dynamics.draw(self.num_particles, self.horizon, generator)
+            worlds = draw_worlds(self.agent, self.num_particles, self.horizon, self.agent.num_timesteps)
             self._worlds[self.recorder.num_steps] = worlds
         return True
 
     def _compare(self, episode: Episode, start: int) -> Forecast:
         """What the worlds drawn at a step predict for the actions taken from it, beside what happened."""
-        task = self.agent.task
-        actions = episode.actions[start : start + self.horizon].reshape(1, -1, episode.actions[0].size)
-        predicted = rollout(
-            self._worlds[start],
-            task.start(episode.observations[start]),
-            torch.as_tensor(actions, dtype=torch.float32, device=self.agent.device),
-            self.num_particles,
-        )
-        observed = episode.observations[start : start + actions.shape[1] + 1]
-        states = predicted[:, :, 0, : task.modelled.observation_size]
-        return Forecast(start, states.cpu().numpy(), observed)
+        actions = episode.actions[start : start + self.horizon]
+        actions = actions.reshape(len(actions), -1)
+        states = states_along(self.agent, self._worlds[start], episode.observations[start], actions, self.num_particles)
+        observed = episode.observations[start : start + len(actions) + 1]
+        return Forecast(start, states[..., : self.agent.task.modelled.observation_size].cpu().numpy(), observed)

@@ -9,8 +9,9 @@ import re
 import subprocess
 import sys
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -77,6 +78,16 @@ def write_gif(frames: Sequence[ndarray], path: str | Path, frames_per_second: fl
     """
     from gym_dgpmpc.checkpoints.files import replace_file  # which takes seconds to import
 
+    content = gif(frames, frames_per_second)
+    replace_file(Path(path), lambda file: file.write(content))
+
+
+def gif(frames: Sequence[ndarray], frames_per_second: float) -> bytes:
+    """The content of such a GIF.
+
+    Raises:
+        ValueError: there are no frames.
+    """
     if not frames:
         raise ValueError("a GIF needs at least one frame, got none")
     # The format counts in hundredths of a second, and browsers slow down pictures shorter than two of them.
@@ -84,11 +95,9 @@ def write_gif(frames: Sequence[ndarray], path: str | Path, frames_per_second: fl
     # One palette for the whole episode: a palette for each frame flickers and costs space.
     middle = Image.fromarray(frames[len(frames) // 2]).quantize(128)
     images = [Image.fromarray(frame).quantize(palette=middle, dither=Image.Dither.NONE) for frame in frames]
-
-    def save(file: IO[bytes]) -> None:
-        images[0].save(file, "GIF", save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=False)
-
-    replace_file(Path(path), save)
+    file = BytesIO()
+    images[0].save(file, "GIF", save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=False)
+    return file.getvalue()
 
 
 def _backends() -> list[str | None]:

@@ -16,6 +16,7 @@ from gym_dgpmpc.formats import FORMATS
 from gym_dgpmpc.runs.figures import observation_labels
 from gym_dgpmpc.runs.folder import FORECASTS, LAST_EPISODE, LOGS, EpisodeRow, RunFolder
 from gym_dgpmpc.runs.forecasts import KeptForecasts
+from gym_dgpmpc.runs.looking import LookInside
 from gym_dgpmpc.runs.plotting import draw_run
 from gym_dgpmpc.runs.recording import EpisodeRecorder, ForecastCallback
 from gym_dgpmpc.runs.rendering import write_gif
@@ -50,6 +51,7 @@ class TrainingRun:
         checkpoint_every: see `MPCAgent.learn`.
         title: heading of the figures.
         formats: of the figures; some of `FORMATS`.
+        look: log what `LookInside` sees, too.
         results_only: print nothing, draw nothing, and skip the training after the last episode, which comes first if
             the run goes on to more episodes.
 
@@ -68,6 +70,7 @@ class TrainingRun:
         checkpoint_every: int | None = None,
         title: str = "",
         formats: Sequence[str] = FORMATS[:1],
+        look: bool = False,
         results_only: bool = False,
     ):
         self.folder, self.num_episodes, self.total_timesteps = folder, num_episodes, total_timesteps
@@ -87,6 +90,7 @@ class TrainingRun:
         self.figures: list[Path] = []
         """The figures that were drawn, once the last episode has ended."""
         self.forecasts = None if results_only else ForecastCallback(self.agent, self.recorder)
+        self.looking = LookInside() if look else None
 
     @property
     def is_complete(self) -> bool:
@@ -107,7 +111,8 @@ class TrainingRun:
             DGPMPCError: planning or the environment failed; everything that was observed is saved.
             KeyboardInterrupt, SystemExit: Ctrl-C or SIGTERM; see `MPCAgent.learn`.
         """
-        callback = CallbackList([*([] if self.forecasts is None else [self.forecasts]), _KeepEpisodes(self)])
+        watching = [each for each in (self.forecasts, self.looking) if each is not None]
+        callback = CallbackList([*watching, _KeepEpisodes(self)])
         # The callback stops a run before the training on its last episode; `learn` without steps does only that.
         steps = 0 if self._has_enough else self.total_timesteps - self.agent.num_timesteps
         for steps_of_call in (steps,) if self.results_only else (steps, 0):

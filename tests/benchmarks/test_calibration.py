@@ -8,12 +8,12 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from benchmarks.calibration import scores as calibration_scores
-from benchmarks.calibration import uci
+from benchmarks.calibration import forecasts, uci
 from benchmarks.calibration.episodes import NUM_LEARNED, SMOOTH, WHITE, Recording, load, save
+from benchmarks.calibration.forecasts import NUM_DRAWS, NUM_PARTICLES, STRIDE, forecast
 from benchmarks.calibration.measure import HORIZONS, measure
-from benchmarks.calibration.scores import LEVELS, NUM_DRAWS, NUM_PARTICLES, STRIDE, forecast, scores
 from benchmarks.calibration.tables import OURS, RIVALS, SCORES, all_scores, beside_rivals
+from gym_dgpmpc.dynamics.scores import LEVELS, scores
 from gym_dgpmpc.dynamics.sparse_gp.model import SparseGPDynamics
 from gym_dgpmpc.types import Transitions
 from tests.oracles.models import normal, seeded
@@ -131,7 +131,7 @@ def test_a_model_is_tested_on_and_off_the_policy(monkeypatch, tmp_path):
     episodes = [episode(normal(seeded(seed), 26, 1).float(), slope) for seed, slope in enumerate(slopes)]
     assert (WHITE, SMOOTH) == (NUM_LEARNED, NUM_LEARNED + 1)
     save(tmp_path / "pendulum.npz", {100: Recording.of(episodes)})
-    monkeypatch.setattr(calibration_scores, "NUM_DRAWS", 4)
+    monkeypatch.setattr(forecasts, "NUM_DRAWS", 4)
     monkeypatch.setitem(HORIZONS, "pendulum", (1, 4))
     make = partial(SparseGPDynamics, num_inducing=10, max_training_iterations=20)
     rows = measure(make, "pendulum", 100, (1, 2), tmp_path)

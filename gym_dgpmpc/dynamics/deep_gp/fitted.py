@@ -17,8 +17,8 @@ from gym_dgpmpc.gp.deep_gp import DeepGP, Factorised, factorise_all
 from gym_dgpmpc.gp.kernels import Kernel
 from gym_dgpmpc.gp.layer import Layer, parameter_shapes
 from gym_dgpmpc.inference import sghmc
-from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
-from gym_dgpmpc.types import StateDict
+from gym_dgpmpc.inference.diagnostics import effective_sample_size, rank_normalised_r_hat
+from gym_dgpmpc.types import Scales, StateDict
 
 
 class Fitted(NamedTuple):
@@ -55,10 +55,15 @@ class Fitted(NamedTuple):
             "noise_std": float(model.noise_variance.sqrt().mean()),
         }
         if len(self.pool) >= 4:
-            metrics["r_hat"] = float(torch.stack([split_r_hat(samples) for samples in by_chain]).median())
+            metrics["r_hat"] = float(torch.stack([rank_normalised_r_hat(samples) for samples in by_chain]).median())
         for index, layer in enumerate(model.layers):
             metrics[f"layer_{index + 1}_kernel_std"] = float(layer.variance.sqrt().mean())
         return metrics
+
+    def scales(self) -> Scales:
+        """Lengthscales of each layer and noise, of every chain."""
+        model = self.factorised.model
+        return Scales([layer.lengthscale for layer in model.layers], model.noise_variance.sqrt())
 
 
 class FittedSizes(NamedTuple):

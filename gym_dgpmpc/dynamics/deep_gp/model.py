@@ -41,7 +41,7 @@ from gym_dgpmpc.gp.kernels import Kernel, KernelName, find_kernel
 from gym_dgpmpc.inference import sghmc, training
 from gym_dgpmpc.inference.following import Follower
 from gym_dgpmpc.inference.settings import InferenceSettings
-from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
+from gym_dgpmpc.types import ObservationSpec, Scales, StateDict, Transitions, TransitionSampler
 
 
 class _Standardised(NamedTuple):
@@ -327,6 +327,10 @@ class DeepGPDynamics(Learner[Fitted]):
     def diagnostics(self) -> dict[str, float]:
         """Mixing of the samples that are kept now, noise and kernel scales; see `Fitted.diagnostics`."""
         return {} if self._fitted is None else self._fitted.diagnostics()
+
+    def scales(self) -> Scales | None:
+        """See `ReportsScales`."""
+        return None if self._fitted is None else self._fitted.scales()
 
     def state_dict(self) -> StateDict:
         """Hyperparameters, normalisers, the chain and the whole pool of samples; empty before the first fit."""

@@ -32,7 +32,7 @@ from gym_dgpmpc.gp.moments import Predictor
 from gym_dgpmpc.gp.sgpr import SparsePosterior, shrinkage, sparse_posterior, sparse_predict
 from gym_dgpmpc.inference.lbfgs import maximise_bound
 from gym_dgpmpc.inference.priors import NOISE_VARIANCE
-from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
+from gym_dgpmpc.types import ObservationSpec, Scales, StateDict, Transitions, TransitionSampler
 
 GPDraw = Literal["DS", "MM", "AMM"]
 GP_DRAWS: tuple[GPDraw, ...] = get_args(GPDraw)
@@ -190,6 +190,14 @@ class SparseGPDynamics(Learner[_Fitted]):
         mean, variance = sparse_predict(model.layers[0], model.noise_variance, posterior, inputs(x))
         variance = (variance + model.noise_variance) * targets.std.square()
         return Mixture(targets.inverse(mean).unsqueeze(0), variance.unsqueeze(0))
+
+    def scales(self) -> Scales | None:
+        """See `ReportsScales`; there is one chain."""
+        if self._fitted is None:
+            return None
+        model = self._fitted.model
+        lengthscales = [layer.lengthscale.unsqueeze(0) for layer in model.layers]
+        return Scales(lengthscales, model.noise_variance.sqrt().unsqueeze(0))
 
     def state_dict(self) -> StateDict:
         """Hyperparameters, normalisers and the posterior; empty before the first fit."""
