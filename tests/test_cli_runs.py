@@ -56,7 +56,7 @@ def test_a_run_goes_on_without_its_flags(folder):
     after = settings(folder)
     assert after["settings"] == before["settings"]
     assert after["options"] == before["options"] == {
-        "env_id": ENV_ID, "threads": 1, "video": False, "checkpoint_every": 5, "formats": ["png", "svg"],
+        "env_id": ENV_ID, "threads": 1, "video": False, "look": False, "checkpoint_every": 5, "formats": ["png", "svg"],
     }  # fmt: skip
     assert (before["episodes"], after["episodes"]) == (1, 2)
     assert read_checkpoint("a/agent.zip").config["arguments"]["temperature"] == 0.7

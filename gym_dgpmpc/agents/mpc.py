@@ -857,7 +857,7 @@ class MPCAgent(BaseAlgorithm):
             observation: [S], the first state, in the environment's units; or a dict, if the environment's are.
             actions: [H, A] within the bounds, for any number of steps H.
             num_particles: P, worlds drawn.
-            seed: of the worlds, with the agent's: the same one gives the same forecast until the model has learned more.
+            seed: of the worlds, with the agent's: the same forecast comes from the same one, until the model changes.
 
         Returns:
             The states [P, H + 1, S] in the environment's units, the first of each the observation. They have the fitted

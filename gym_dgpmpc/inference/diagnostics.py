@@ -44,9 +44,9 @@ def split_r_hat(samples: Float[Tensor, "n V"]) -> Float[Tensor, "V"]:
 def rank_normalised_r_hat(samples: Float[Tensor, "n V"]) -> Float[Tensor, "V"]:
     """The larger of two split R-hats of each coordinate of one chain: of its ranks, and of its distances' ranks.
 
-    Ranks are made normal scores, Phi^-1((rank - 3/8) / (n + 1/4)), so that heavy tails do not hide a drift; distances are
-    those from the median, so that halves that differ in their spread alone are seen (Vehtari et al. 2021, section 4).
-    Of an odd number of samples the one in the middle is left out.
+    Ranks are made normal scores, Phi^-1((rank - 3/8) / (n + 1/4)), so that heavy tails do not hide a drift; distances
+    are those from the median, so that halves that differ in their spread alone are seen (Vehtari et al. 2021, section
+    4). Of an odd number of samples the one in the middle is left out.
 
     Raises:
         ValueError: fewer than four samples.

@@ -4,8 +4,9 @@
 """
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,8 +42,8 @@ DIAGNOSTICS = ("effective_sample_size", "r_hat", "noise_std")
 SATURATED = 0.01
 """An action within this share of its range of a bound counts as saturated."""
 
-FIRST_GUESS = 2.0
-"""Seconds that an episode's pictures are expected to take before any were drawn."""
+FIRST_GUESS = 0.7
+"""Seconds that a picture is expected to take before it was drawn once."""
 
 PREDICTED, OBTAINED = "look/predicted_reward_per_step", "look/obtained_reward_per_step"
 LAYOUT = {
@@ -57,8 +58,8 @@ LAYOUT = {
 class _Watched(NamedTuple):
     """The episode of the first environment while it runs."""
 
-    index: int
-    """Of the store's episodes."""
+    episode: int
+    """Its number in the store."""
     starts: list[int]
     """Steps at which forecasts are still to begin."""
     worlds: dict[int, TransitionSampler]
@@ -97,7 +98,8 @@ class LookInside(BaseCallback):
         num_windows: forecasts of an episode.
         num_particles: worlds of each.
         share: the most processor time to spend on looking, of that of the whole run, in (0, 1]: pictures beyond it are
-            left out until it suffices again; 1 draws them always. Numbers always come.
+            left out until it suffices again, the longest missing comes first then; 1 draws them all. Numbers always
+            come.
         video: log each episode as a moving picture with step, return and action in it, too; the environment must render
             ``rgb_array``. It does not count towards ``share``.
 
@@ -112,7 +114,7 @@ class LookInside(BaseCallback):
 
     def __init__(
         self,
-        num_windows: int = 3,
+        num_windows: int = 2,
         num_particles: int = NUM_FORECAST_PARTICLES,
         *,
         share: float = 0.02,
@@ -123,7 +125,9 @@ class LookInside(BaseCallback):
         check_reals("(0, 1]", share=share)
         self.num_windows, self.num_particles, self.share, self.video = num_windows, num_particles, share, video
         self.seconds, self.pictures = 0.0, dict[str, Picture]()
-        self._started, self._picture_seconds = time.process_time(), FIRST_GUESS
+        self._started = time.process_time()
+        self._costs, self._newest = dict[str, float](), dict[str, int]()  # of pictures by name: seconds, timestep
+        self._drawable: dict[str, Callable[[], Picture]] = {}
         self._watched: _Watched | None = None
         self._losses: list[tuple[int, float]] = []
         self._rewards: dict[int, tuple[float, float]] = {}
@@ -160,7 +164,7 @@ class LookInside(BaseCallback):
         with self._counted():
             self._listen()
             self._add_rewards(np.flatnonzero(has_ended))
-            if self._watched is None or self._watched.index != running.index:
+            if self._watched is None or self._watched.episode != running.index:
                 self._look_back()
                 starts = picked_starts(agent, running.index, self.num_windows)
                 self._watched = _Watched(running.index, starts, {}, [])
@@ -168,6 +172,7 @@ class LookInside(BaseCallback):
                 self._look_back()
             elif agent.is_fitted:
                 self._look_ahead(self._watched, len(running.record.rewards))
+        self._draw()
         return True
 
     def _on_training_end(self) -> None:
@@ -213,20 +218,26 @@ class LookInside(BaseCallback):
     def _look_back(self) -> None:
         """Log the episode that was watched, once."""
         watched, self._watched = self._watched, None
-        episode = None if watched is None else played(self.agent, watched.index)
+        episode = None if watched is None else played(self.agent, watched.episode)
         if watched is None or episode is None:
             return
         compared = compare(self.agent, watched.worlds, episode, self.num_particles)
         self._write({f"look/{name}": value for name, value in self._numbers(watched, episode, compared).items()})
-        if not self._tensorboard:
-            return
         self._write_pictures({f"action_{index}": column.copy() for index, column in enumerate(episode.actions.T)})
-        began = time.process_time()
-        affordable = self.share * (began - self._started) - self.seconds
-        if self.share == 1 or self._picture_seconds <= affordable:
-            self.pictures = self._drawn(watched, episode, compared)
-            self._write_pictures({name: Figure(each, close=False) for name, each in self.pictures.items()})
-            self._picture_seconds = time.process_time() - began
+        self._drawable = self._pictures_of(watched, episode, compared)
+
+    def _draw(self) -> None:
+        """Draw and log what was looked at, as far as there is time, what was left out longest first."""
+        drawable, self._drawable = self._drawable, {}
+        for name in sorted(drawable, key=lambda name: self._newest.get(name, -1)) if self._tensorboard else ():
+            left = self.share * (time.process_time() - self._started) - self.seconds
+            if self.share < 1 and self._costs.get(name, FIRST_GUESS) > left:
+                continue
+            before = self.seconds
+            with self._counted():
+                self.pictures[name] = drawable[name]()
+                self._write_pictures({name: Figure(self.pictures[name], close=False)})
+            self._costs[name], self._newest[name] = self.seconds - before, self.num_timesteps
 
     def _numbers(self, watched: _Watched, episode: PlayedEpisode, compared: Compared | None) -> dict[str, float]:
         """What can be said of an episode in numbers."""
@@ -248,27 +259,33 @@ class LookInside(BaseCallback):
                 numbers[f"particle_std_step_{step}"] = float(compared.spread[step - 1].mean())
         return numbers
 
-    def _drawn(self, watched: _Watched, episode: PlayedEpisode, compared: Compared | None) -> dict[str, Picture]:
-        """The pictures of an episode."""
-        agent, env, pictures = self.agent, self.agent.get_env(), dict[str, Picture]()
-        modelled, model = agent.task.modelled, agent.dynamics
+    def _pictures_of(
+        self, watched: _Watched, episode: PlayedEpisode, compared: Compared | None
+    ) -> dict[str, Callable[[], Picture]]:
+        """How to draw each picture of an episode."""
+        agent, env = self.agent, self.agent.get_env()
+        modelled, model, losses = agent.task.modelled, agent.dynamics, list(self._losses)
         assert env is not None
         labels = observation_labels(type(env.get_attr("unwrapped", [0])[0]), modelled.observation_size)
+        scales = model.scales() if isinstance(model, ReportsScales) else None
+        rewards = [(number, *pair) for number, pair in sorted(self._rewards.items())]
+
+        def training() -> Picture:
+            of_all = [*labels, *["reward"] * modelled.reward, *["termination"] * modelled.terminated]
+            encoder = Encoder(modelled.size, episode.actions.shape[1], modelled.spec)
+            inputs = encoder.input_names(of_all, [f"action {i}" for i in range(encoder.action_size)])
+            return training_figure(losses, scales, inputs, [of_all[i] for i in encoder.predicted])
+
+        drawable: dict[str, Callable[[], Picture]] = {}
         if compared is not None:
             title = f"forecasts of the episode that ended at step {self.num_timesteps}"
-            pictures["fan"] = prediction_fan(compared.forecasts, labels=[*labels, "reward"], title=title)
             names = [labels[i] for i in predicted_numbers(agent)]
-            pictures["scores"] = score_figure(compared.scores, compared.spread, names)
-        scales = model.scales() if isinstance(model, ReportsScales) else None
-        if scales is not None or self._losses:
-            labels += ["reward"] * modelled.reward + ["termination"] * modelled.terminated
-            encoder = Encoder(modelled.size, episode.actions.shape[1], modelled.spec)
-            inputs = encoder.input_names(labels, [f"action {i}" for i in range(encoder.action_size)])
-            targets = [labels[i] for i in encoder.predicted]
-            pictures["training"] = training_figure(self._losses, scales, inputs, targets)
-        rewards = [(number, *pair) for number, pair in sorted(self._rewards.items())]
-        pictures["planning"] = planning_figure(watched.plan_scores, episode.actions, self._bounds, rewards)
-        return pictures
+            drawable["fan"] = partial(prediction_fan, compared.forecasts, labels=[*labels, "reward"], title=title)
+            drawable["scores"] = partial(score_figure, compared.scores, compared.spread, names)
+        drawable["planning"] = partial(planning_figure, watched.plan_scores, episode.actions, self._bounds, rewards)
+        if scales is not None or losses:
+            drawable["training"] = training
+        return drawable
 
     @property
     def _bounds(self) -> tuple[Float[ndarray, " A"], Float[ndarray, " A"]]:

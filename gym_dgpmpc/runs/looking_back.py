@@ -1,9 +1,10 @@
-"""What `LookInside` computes: where forecasts begin, what they are worth once their episode has ended, and a plan's scores.
+"""What `LookInside` computes: where forecasts begin, what they were worth in the end, and the scores of a plan.
 
 Nothing here moves a random stream of the agent, or changes anything of it.
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -90,10 +91,8 @@ def plan_scores(agent: MPCAgent, key: int) -> list[Float[ndarray, " K"]]:
             found.append(result.detach().cpu().numpy())
             return result
 
-        try:
+        with suppress(PlanningError):  # what was scored shows why; whether the agent's own plans fail, it says itself
             agent.planner.plan(recorded, agent.planner.shift(plan, age), generator)
-        except PlanningError:
-            pass  # what was scored shows why; whether the agent's own plans fail, it says itself
     return found
 
 

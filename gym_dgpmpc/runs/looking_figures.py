@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogFormatter, MaxNLocator
 from numpy import ndarray
 
 from gym_dgpmpc.runs.figures import BANDS, MAX_DIMENSIONS, MODEL_COLOUR, RANDOM_COLOUR, TRUTH_COLOUR
@@ -80,12 +80,15 @@ def training_figure(
     _dress(panels[0], "loss of the last training")
     if scales is not None:
         noise = scales.noise_std.detach().cpu().numpy()
-        _bars(panels[1], [noise], targets, "noise, in spreads of what is predicted", [""])
+        _bars(panels[1], [noise], targets, "noise std, of 1 without a model", [""])
         panels[1].axvline(1.0, color=TRUTH_COLOUR, linewidth=0.8, linestyle=":")
         lengthscales = [each.detach().cpu().numpy()[:, :MOST_INPUTS] for each in scales.lengthscales]
         layers = [f"layer {index + 1}" for index in range(num_layers)]
-        _bars(panels[2], lengthscales, inputs[:MOST_INPUTS], "lengthscale: the shorter, the more it matters", layers)
-        panels[2].set_xscale("log")
+        _bars(panels[2], lengthscales, inputs[:MOST_INPUTS], "lengthscales: short ones matter", layers)
+        for panel in panels[1:]:
+            panel.set_xscale("log")
+            for each in (panel.xaxis.set_major_formatter, panel.xaxis.set_minor_formatter):
+                each(LogFormatter(labelOnlyBase=False, minor_thresholds=(1.5, 0.5)))
     return figure
 
 
@@ -143,7 +146,7 @@ def _bars(
         places = np.arange(len(names)) + (index - (len(groups) - 1) / 2) * height
         axes.barh(places, np.exp(np.log(values).mean(0)), 0.9 * height, color=f"C{index}", alpha=0.6, label=label)
         axes.plot(values.T, places, ".", color=RANDOM_COLOUR, markersize=3)
-    axes.set_yticks(np.arange(len(names)), [_short(name) for name in names], fontsize="small")
+    axes.set_yticks(np.arange(len(names)), [textwrap.fill(name, 26) for name in names], fontsize="small")
     axes.invert_yaxis()
     if len(groups) > 1:
         axes.legend(loc="best", fontsize="x-small")

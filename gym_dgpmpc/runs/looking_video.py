@@ -54,11 +54,10 @@ class EpisodeVideo:
         image = Summary.Image(
             height=height, width=width, colorspace=3, encoded_image_string=gif(frames, self._frames_per_second)
         )
+        summary = Summary(value=[Summary.Value(tag="look/video", image=image)])
         for output in outputs:
             # SB3's own way to log a video needs moviepy.
-            writer = output.writer.file_writer
-            assert writer is not None
-            writer.add_summary(Summary(value=[Summary.Value(tag="look/video", image=image)]), step)
+            output.writer._get_file_writer().add_summary(summary, step)
             output.writer.flush()
 
 

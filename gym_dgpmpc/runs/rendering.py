@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -79,7 +79,11 @@ def write_gif(frames: Sequence[ndarray], path: str | Path, frames_per_second: fl
     from gym_dgpmpc.checkpoints.files import replace_file  # which takes seconds to import
 
     content = gif(frames, frames_per_second)
-    replace_file(Path(path), lambda file: file.write(content))
+
+    def save(file: IO[bytes]) -> None:
+        file.write(content)
+
+    replace_file(Path(path), save)
 
 
 def gif(frames: Sequence[ndarray], frames_per_second: float) -> bytes:

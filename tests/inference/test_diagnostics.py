@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 import scipy.signal
+import scipy.stats
 import torch
 
-from gym_dgpmpc.inference.diagnostics import effective_sample_size, split_r_hat
+from gym_dgpmpc.inference.diagnostics import effective_sample_size, rank_normalised_r_hat, split_r_hat
 
 
 def autoregression(rho, length, num_chains, seed=0):
@@ -73,3 +74,37 @@ def test_halves_at_rest_in_different_places_disagree():
 def test_r_hat_of_too_few_samples_is_an_error(length):
     with pytest.raises(ValueError, match=rf"\b4 samples.* {length}$"):
         split_r_hat(torch.zeros(length, 2))
+
+
+def ranked_r_hat(chain):
+    """Vehtari et al. 2021, equations 3, 4 and 14, chain by chain with SciPy's ranks."""
+    half = len(chain) // 2
+    halves = np.stack([chain[:half], chain[-half:]])
+
+    def r_hat(values):
+        z = scipy.stats.norm.ppf((scipy.stats.rankdata(values).reshape(values.shape) - 3 / 8) / (values.size + 1 / 4))
+        within, between = z.var(1, ddof=1).mean(), half * z.mean(1).var(ddof=1)
+        return np.sqrt(((half - 1) / half * within + between / half) / within)
+
+    return max(r_hat(halves), r_hat(np.abs(halves - np.median(halves))))
+
+
+@pytest.mark.parametrize("length", [6, 7, 40, 41])
+def test_rank_normalised_r_hat(length):
+    """Of a mixing chain, one that drifts, one with Cauchy's tails, one with two values, and one that grows wider."""
+    chain = autoregression(0.5, length, 5, seed=1).numpy()
+    chain[:, 1] += np.linspace(0, 3, length)
+    chain[:, 2] = np.tan(np.pi * (scipy.stats.norm.cdf(chain[:, 2]) - 0.5))
+    chain[:, 3] = np.arange(length) % 3 == 0
+    chain[:, 4] *= np.linspace(0.1, 5, length)
+    found = rank_normalised_r_hat(torch.from_numpy(chain))
+    np.testing.assert_allclose(found, [ranked_r_hat(column) for column in chain.T], rtol=1e-9)
+
+
+def test_ranks_see_what_moments_do_not():
+    """A chain that grows wider has halves of one mean; one at rest agrees with itself."""
+    chain = autoregression(0.0, 1000, 2)
+    chain[500:, 0] *= 5
+    chain[:, 1] = 2.0
+    assert split_r_hat(chain)[0] < 1.02 and rank_normalised_r_hat(chain)[0] > 1.2
+    assert rank_normalised_r_hat(chain)[1] == 1.0
