@@ -39,7 +39,7 @@ def scores(particles: Float[Tensor, "N K S"], truth: Float[Tensor, "K S"]) -> di
     squared = ((truth - mean) / std).square()
     result["nll"] = float((0.5 * squared + std.log() + 0.5 * math.log(2 * math.pi)).mean())
     # E|x - x'| of a sorted sample: 2 / n^2 sum_i (2 i - n - 1) x_(i), here without the pairs of a particle with itself.
-    weight = (2 * torch.arange(1, count + 1, dtype=torch.float64) - count - 1).view(-1, 1, 1)
+    weight = (2 * torch.arange(1, count + 1, dtype=torch.float64, device=truth.device) - count - 1).view(-1, 1, 1)
     apart = 2.0 / (count * (count - 1)) * (weight * ordered).sum(0)
     result["crps"] = float(((particles - truth).abs().mean(0) - 0.5 * apart).mean())
     result["rmse"] = float((truth - mean).square().mean().sqrt())

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure as Picture
 from numpy import ndarray
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Figure, TensorBoardOutputFormat
+from stable_baselines3.common.logger import Figure, KVWriter, TensorBoardOutputFormat
 
 from gym_dgpmpc.agents import MPCAgent
 from gym_dgpmpc.agents.forecasting import draw_worlds
@@ -34,7 +34,13 @@ from gym_dgpmpc.runs.looking_back import (
 from gym_dgpmpc.runs.looking_figures import planning_figure, score_figure, training_figure
 from gym_dgpmpc.runs.looking_video import EpisodeVideo
 from gym_dgpmpc.runs.recording import NUM_FORECAST_PARTICLES
-from gym_dgpmpc.types import ProgressFn, ReportsDiagnostics, ReportsProgress, ReportsScales, TransitionSampler
+from gym_dgpmpc.types import (
+    ProgressFn,
+    ReportsDiagnostics,
+    ReportsProgress,
+    ReportsScales,
+    TransitionSampler,
+)
 
 DIAGNOSTICS = ("effective_sample_size", "r_hat", "noise_std")
 """Of those that a model reports, which are shown."""
@@ -128,6 +134,8 @@ class LookInside(BaseCallback):
         self._started = time.process_time()
         self._costs, self._newest = dict[str, float](), dict[str, int]()  # of pictures by name: seconds, timestep
         self._drawable: dict[str, Callable[[], Picture]] = {}
+        self._heard: ReportsProgress | None = None  # whose training is listened to
+        self._ear: _Losses | None = None  # by what
         self._watched: _Watched | None = None
         self._losses: list[tuple[int, float]] = []
         self._rewards: dict[int, tuple[float, float]] = {}
@@ -176,15 +184,22 @@ class LookInside(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        model = self.agent.dynamics
-        if isinstance(model, ReportsProgress) and isinstance(model.on_progress, _Losses):
-            model.on_progress = model.on_progress.listener
+        self._stop_listening()
 
     def _listen(self) -> None:
         """Hear of the model's losses; asked again and again, since an agent may begin with a model anew."""
         model = self.agent.dynamics
-        if isinstance(model, ReportsProgress) and not isinstance(model.on_progress, _Losses):
-            model.on_progress = _Losses(self._losses, model.on_progress)
+        if not isinstance(model, ReportsProgress) or model is self._heard:
+            return
+        self._stop_listening()
+        self._heard, self._ear = model, _Losses(self._losses, model.on_progress)
+        model.on_progress = self._ear
+
+    def _stop_listening(self) -> None:
+        """Leave the model as it was."""
+        if self._heard is not None and self._ear is not None:
+            self._heard.on_progress = self._ear.listener
+        self._heard = self._ear = None
 
     def _look_ahead(self, watched: _Watched, step: int) -> None:
         """Draw the worlds of a forecast, if one is to begin by now."""
@@ -301,7 +316,8 @@ class LookInside(BaseCallback):
     def _write(self, numbers: Mapping[str, float]) -> None:
         """Give every output of the logger numbers, at once: what waits in the logger stays there."""
         for output in self.logger.output_formats:
-            output.write(dict(numbers), dict.fromkeys(numbers, ()), self.num_timesteps)
+            if isinstance(output, KVWriter):
+                output.write(dict(numbers), dict.fromkeys(numbers, ()), self.num_timesteps)
 
     def _write_pictures(self, values: Mapping[str, Any]) -> None:
         """Give TensorBoard what other outputs cannot show."""

@@ -9,7 +9,7 @@ import pytest
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import KVWriter, configure
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -106,7 +106,7 @@ def test_the_rewards_are_those_of_the_records(seen):
     assert events.Scalars("look/obtained_reward_per_step")[-1].value == pytest.approx(obtained)
 
 
-class KeepWhatWasWritten:
+class KeepWhatWasWritten(KVWriter):
     """An output of a logger that keeps rows."""
 
     def __init__(self):
