@@ -6,6 +6,7 @@ from functools import partial
 import gymnasium
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gym_dgpmpc.agents import DGPMPCAgent
 from gym_dgpmpc.errors import PlanningError
@@ -18,14 +19,14 @@ make_agent = partial(DGPMPCAgent, **SMALLEST_AGENT, seed=0)
 SETTINGS = {"environment": "ToyPush-v0", "seed": 0}
 
 
-def training_run(path, num_episodes=2, env_id="ToyPush-v0", **env_arguments):
+def training_run(path, num_episodes=2, env_id="ToyPush-v0", look=False, **env_arguments):
     for holder in HOLDERS:  # what an earlier process would have let go of by its end
         holder.close()
     folder = RunFolder(path, SETTINGS)
     HOLDERS[:] = [folder]
     env = gymnasium.make(env_id, **env_arguments)
     steps = EPISODE_STEPS * (1 + num_episodes)
-    run = TrainingRun(folder, env, make_agent, num_episodes=num_episodes, total_timesteps=steps)
+    run = TrainingRun(folder, env, make_agent, num_episodes=num_episodes, total_timesteps=steps, look=look)
     folder.write_settings(episodes=num_episodes)
     return run
 
@@ -60,6 +61,14 @@ def test_results(tmp_path, capsys):
     assert settings["episodes"] == 2
     assert "torch" in settings["versions"]
     assert settings["revision"]
+
+
+def test_looks_inside_if_asked_to(tmp_path):
+    for look in (False, True):
+        folder = tmp_path / str(look)
+        training_run(folder, num_episodes=1, look=look).train(progress_bar=False)
+        (logs,) = (folder / "tensorboard").iterdir()
+        assert ("look/coverage_90" in EventAccumulator(str(logs)).Reload().Tags()["scalars"]) == look
 
 
 def test_the_saved_agent_has_learned_from_every_episode(tmp_path):
