@@ -18,6 +18,7 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.integrate import solve_ivp
@@ -125,7 +126,7 @@ class Trials(gymnasium.Wrapper[ndarray, ndarray, ndarray, ndarray]):
 
     keeps_actions = True
 
-    def __init__(self, env: OutsideCartPole):
+    def __init__(self, env: gymnasium.Env[ndarray, ndarray]):
         super().__init__(env)
         self.returns: list[float] = []
         self.succeeded: list[bool] = []
@@ -144,7 +145,7 @@ class Trials(gymnasium.Wrapper[ndarray, ndarray, ndarray, ndarray]):
 def measure(wanted: Row) -> Row:
     """One agent's trials."""
     started = time.process_time()
-    env = Trials(OutsideCartPole())
+    env = Trials(TimeLimit(OutsideCartPole(), STEPS))  # which tells the searches how long an episode is
     spec = ObservationSpec(angles=(2,))
     agent = METHODS[wanted["method"]](env, observation_spec=spec, learning_starts=STEPS, seed=wanted["seed"])
     agent.learn((1 + TRIALS) * STEPS)

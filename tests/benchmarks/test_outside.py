@@ -1,13 +1,12 @@
 """The cart-pole of MC-PILCO: the laws of mechanics, what counts as success, and what is written down of a run."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 
 from benchmarks import outside
 from benchmarks.outside import CART, FRICTION, GRAVITY, LENGTH, POLE, STEPS, TRIALS, OutsideCartPole, derivative
 from gym_dgpmpc import MCPILCOAgent
+from gym_dgpmpc.tasks.environment import time_limit
 
 
 def energy(state):
@@ -75,10 +74,17 @@ def test_success_is_to_stand_for_the_whole_last_second(step, state, succeeded):
 def test_each_trial_is_in_the_row_and_on_the_page(monkeypatch):
     quick = {"first_training_iterations": 5, "training_iterations": 5, "num_samples": 5, "num_inducing": 10}
     quick |= {"num_worlds": 5, "num_paths": 1, "first_search_steps": 1, "search_steps": 1, "search_horizon": 5}
-    monkeypatch.setattr(outside, "METHODS", {"quick": partial(MCPILCOAgent, sample_spacing=1, **quick)})
+    made = []
+
+    def make(env, **settings):
+        made.append(MCPILCOAgent(env, sample_spacing=1, **quick, **settings))
+        return made[-1]
+
+    monkeypatch.setattr(outside, "METHODS", {"quick": make})
     row = {"method": "quick", "seed": 100} | outside.measure({"method": "quick", "seed": 100})
     assert len(row["returns"]) == len(row["succeeded"]) == TRIALS and row["cpu_minutes"] > 0
     assert all(0.0 < each <= STEPS for each in row["returns"])
+    assert time_limit(made[0].env) == STEPS  # or the policies are searched over other episodes
     better = row | {"succeeded": [False, False, True, True, True], "seed": 101, "command": "c"}
     page = outside.page([row | {"succeeded": [False] * TRIALS, "command": "c"}, better])
     assert "| quick | 100, 101 | 0 of 2 | 0 of 2 | 1 of 2 | 1 of 2 | 1 of 2 |" in page
