@@ -16,16 +16,23 @@ NETWORKS = {"num_hidden_layers": 1, "hidden_size": 8, "weight_decay": (1e-4, 1e-
 PLANNING = {"horizon": 3, "num_candidates": 6, "num_elites": 2, "num_iterations": 1}
 PETS = NETWORKS | PLANNING | {"num_particles": 5}
 OFF_POLICY = {"batch_size": 4, "buffer_size": 100, "learning_starts": EPISODE_STEPS}
+DEEP_GP = {name: value for name, value in SMALLEST_AGENT.items() if name != "num_layers"}
+SPARSE_GP = {"num_inducing": 6, "max_training_iterations": 3}
+SEARCH = {"num_worlds": 2, "num_paths": 1, "first_search_steps": 1, "search_steps": 1, "search_horizon": 2}
 TINY = {
-    "DGP-MPC L=1 matern32": {name: value for name, value in SMALLEST_AGENT.items() if name != "num_layers"},
+    "DGP-MPC L=1 matern32": DEEP_GP,
     "PETS TS1": PETS,
     "PETS TSinf": PETS,
     "PETS TSinf to its optimum": PETS | {"num_epochs": 2, "patience": 1},
     "PETS as published": PETS,
-    "GP-MM": PLANNING | {"num_inducing": 6, "max_training_iterations": 3},
-    "GP-DS": PLANNING | {"num_inducing": 6, "max_training_iterations": 3},
-    "GP-MM with noise": PLANNING | {"num_inducing": 6, "max_training_iterations": 3},
-    "GP-DS with noise": PLANNING | {"num_inducing": 6, "max_training_iterations": 3},
+    "GP-MM": PLANNING | SPARSE_GP,
+    "GP-DS": PLANNING | SPARSE_GP,
+    "GP-MM with noise": PLANNING | SPARSE_GP,
+    "GP-DS with noise": PLANNING | SPARSE_GP,
+    "GP-MPC": SPARSE_GP | {"horizon": 3, "num_iterations": 1, "num_starts": 1, "num_particles": 10},
+    "MC-PILCO": DEEP_GP | SEARCH,
+    "MC-PILCO DGP L=2": DEEP_GP | SEARCH,
+    "PILCO": SPARSE_GP | {"max_search_iterations": 1, "search_horizon": 2},
     "DGP L=2 and PETS": for_mixture(SMALLEST_AGENT, NETWORKS | {"num_epochs": 2}),
     "true dynamics": PLANNING,
     "SAC": OFF_POLICY,
