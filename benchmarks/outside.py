@@ -18,7 +18,6 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from gymnasium.wrappers import TimeLimit
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.integrate import solve_ivp
@@ -68,12 +67,13 @@ class OutsideCartPole(gymnasium.Env[ndarray, ndarray]):
         path: true states of the running trial, [4] each.
     """
 
-    metadata: Mapping[str, Any] = MappingProxyType({"render_modes": []})  # type: ignore[assignment]
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium demands a dict)
 
     def __init__(self, noise: float = 0.01):
         self.noise = noise
         self.observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float32)
         self.action_space = spaces.Box(-FORCE, FORCE, (1,), np.float32)
+        self.observation_spec = ObservationSpec(angles=(2,))
         self.path: list[ndarray] = []
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[ndarray, dict]:
@@ -110,6 +110,8 @@ class OutsideCartPole(gymnasium.Env[ndarray, ndarray]):
         return (self.path[-1] + self.noise * self.np_random.standard_normal(4)).astype(np.float32)
 
 
+gymnasium.register("OutsideCartPole-v0", "benchmarks.outside:OutsideCartPole", max_episode_steps=STEPS)
+
 METHODS: Mapping[str, Callable[..., MPCAgent]] = MappingProxyType(
     {
         "DGP-MPC": DGPMPCAgent,
@@ -124,7 +126,7 @@ METHODS: Mapping[str, Callable[..., MPCAgent]] = MappingProxyType(
 class Trials(gymnasium.Wrapper[ndarray, ndarray, ndarray, ndarray]):
     """Keeps the return of each trial that is over, and whether it succeeded."""
 
-    keeps_actions = True
+    keeps_actions = keeps_observations = True
 
     def __init__(self, env: gymnasium.Env[ndarray, ndarray]):
         super().__init__(env)
@@ -145,9 +147,8 @@ class Trials(gymnasium.Wrapper[ndarray, ndarray, ndarray, ndarray]):
 def measure(wanted: Row) -> Row:
     """One agent's trials."""
     started = time.process_time()
-    env = Trials(TimeLimit(OutsideCartPole(), STEPS))  # which tells the searches how long an episode is
-    spec = ObservationSpec(angles=(2,))
-    agent = METHODS[wanted["method"]](env, observation_spec=spec, learning_starts=STEPS, seed=wanted["seed"])
+    env = Trials(gymnasium.make("OutsideCartPole-v0"))
+    agent = METHODS[wanted["method"]](env, learning_starts=STEPS, seed=wanted["seed"])
     agent.learn((1 + TRIALS) * STEPS)
     return {
         "returns": env.returns[1:],

@@ -62,6 +62,15 @@ def _shipped(env_id: str, change: str = "") -> Task:
     return Task(env_id + change, ENVIRONMENTS[env_id][1], for_model_free=of_model_free, idle_return=idle)
 
 
+NO_PRESETS = "none"
+"""Of a task that is played as one that nobody has seen before: with the defaults of the agents' classes."""
+
+
+def _unknown(env_id: str, episode_steps: int) -> Task:
+    """A task without its presets."""
+    return Task(f"{env_id}:no presets", episode_steps, presets_of=NO_PRESETS)
+
+
 ALL_TASKS = (
     *map(_shipped, ENVIRONMENTS),
     _shipped("RiskSensitiveHalfCheetah-v0", ":50 episodes"),
@@ -72,6 +81,10 @@ ALL_TASKS = (
     Task("Reacher-v5", 50),
     Task("Swimmer-v5", 1000),
     Task("FetchReachDense-v4", 50, env_id="gym_dgpmpc.envs.robotics:FetchReachDense-v4"),
+    Task("OutsideCartPole-v0", 60, env_id="benchmarks.outside:OutsideCartPole-v0"),
+    _unknown("ModCartPole-v0", 200),
+    _unknown("Pendulum-v1", 200),
+    _unknown("Reacher-v5", 50),
 )
 
 TASKS: Mapping[str, Task] = {task.name: task for task in ALL_TASKS}
