@@ -20,17 +20,15 @@ from gym_dgpmpc.errors import NotDifferentiableError
 from gym_dgpmpc.planning.ascent import AdamAscent, LBFGSAscent
 from gym_dgpmpc.planning.cem import CEM
 from gym_dgpmpc.planning.coloured_noise import coloured_noise
-from gym_dgpmpc.planning.mppi import Sequence
 from gym_dgpmpc.planning.search import (
     check_bounds,
     check_plan,
     iterations,
-    midpoints,
     no_finite_score,
     scored,
-    shifted,
     with_proposals,
 )
+from gym_dgpmpc.planning.sequence import CarriesSequence, Sequence
 from gym_dgpmpc.types import Objective, PlanInfo
 
 Optimiser = Literal["adam", "lbfgs"]
@@ -41,7 +39,7 @@ ASCENTS: Mapping[Optimiser, type[AdamAscent] | type[LBFGSAscent]] = MappingProxy
 )
 
 
-class GradientAscent:
+class GradientAscent(CarriesSequence):
     """Climb the objective from K sequences side by side, each on its own; the plan is the best one that was scored.
 
     The first sequence is the one that is carried, or the mean that `CEM` found from it; the others are drawn around it.
@@ -117,19 +115,6 @@ class GradientAscent:
         self.cem_iterations = cem_iterations
         self.start_std = start_std
         self.noise_beta = noise_beta
-
-    def initial_plan(self) -> Sequence:
-        """The middle of the action range at every step."""
-        return Sequence(midpoints(self.action_low, self.action_high, self.horizon))
-
-    def shift(self, plan: Sequence, num_actions: int) -> Sequence:
-        """Drop the first ``num_actions`` and fill the end with the midpoint.
-
-        Raises:
-            ValueError: the plan is not of this planner's shape, or has fewer than ``num_actions`` actions.
-        """
-        check_plan(plan, self.initial_plan())
-        return Sequence(shifted(plan.actions, num_actions, midpoints(self.action_low, self.action_high, 1)))
 
     @torch.no_grad()
     def plan(

@@ -8,7 +8,7 @@ Control: Theory and Applications to Autonomous Driving".
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -23,9 +23,9 @@ from gym_dgpmpc.planning.search import (
     midpoints,
     no_finite_score,
     scored,
-    shifted,
     with_proposals,
 )
+from gym_dgpmpc.planning.sequence import CarriesSequence, Sequence
 from gym_dgpmpc.types import Objective, PlanInfo
 
 
@@ -52,13 +52,7 @@ def path_weights(
     return torch.softmax((below / scale - cost).masked_fill(~finite, -math.inf), dim=0)
 
 
-class Sequence(NamedTuple):
-    """A sequence of actions, and nothing else."""
-
-    actions: Float[Tensor, "H A"]
-
-
-class MPPI:
+class MPPI(CarriesSequence):
     """Model-predictive path integral control: u <- sum_k w_k v_k with w_k ~ exp(R_k / lambda) and v_k = u + e_k.
 
     The noise e has the same standard deviation in every iteration; candidates v are clipped to the bounds, and e_k is
@@ -122,19 +116,6 @@ class MPPI:
         self.noise_std = noise_std
         self.noise_beta = noise_beta
         self.control_cost = control_cost
-
-    def initial_plan(self) -> Sequence:
-        """The middle of the action range at every step."""
-        return Sequence(midpoints(self.action_low, self.action_high, self.horizon))
-
-    def shift(self, plan: Sequence, num_actions: int) -> Sequence:
-        """Drop the first ``num_actions`` and fill the end with the midpoint.
-
-        Raises:
-            ValueError: the plan is not of this planner's shape, or has fewer than ``num_actions`` actions.
-        """
-        check_plan(plan, self.initial_plan())
-        return Sequence(shifted(plan.actions, num_actions, midpoints(self.action_low, self.action_high, 1)))
 
     @torch.no_grad()
     def plan(

@@ -12,7 +12,7 @@ from gym_dgpmpc import MPCAgent
 from gym_dgpmpc.dynamics.true_dynamics import TrueDynamics
 from gym_dgpmpc.errors import NotDifferentiableError
 from gym_dgpmpc.planning import GradientAscent, rollout_objective
-from gym_dgpmpc.planning.mppi import Sequence
+from gym_dgpmpc.planning.sequence import Sequence
 from tests.oracles import lqr
 from tests.oracles.models import seeded
 

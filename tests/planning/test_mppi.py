@@ -8,7 +8,8 @@ import scipy.special
 import torch
 
 from gym_dgpmpc.planning import MPPI
-from gym_dgpmpc.planning.mppi import Sequence, path_weights
+from gym_dgpmpc.planning.mppi import path_weights
+from gym_dgpmpc.planning.sequence import Sequence
 from tests.oracles.models import seeded
 
 INF = math.inf
