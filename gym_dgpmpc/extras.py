@@ -6,6 +6,7 @@ EXTRAS = {
     "moviepy": "video",
     "onnx": "onnx",
     "pygame": "classic",
+    "rl_zoo3": "zoo",
 }
 """Module -> the extra that installs it."""
 

@@ -31,7 +31,7 @@ LAYERS = (
     {"runs"},
     {"__init__"},
     {"options", "cli"},
-    {"__main__"},
+    {"__main__", "zoo"},
     {"benchmarks"},
 )
 """Each layer imports only from itself and from those above it. The public names stand below all that they name, and the

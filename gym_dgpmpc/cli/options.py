@@ -57,10 +57,19 @@ SOURCE_TEXTS = {
 
 def agent_asked_for(args: Sequence[str]) -> str:
     """The agent that a command line names, or the default; what is wrong about it is said when it is parsed."""
-    given = [value for value in args if value.startswith("--agent=")]
-    following = [after for option, after in pairwise(args) if option == "--agent"]
-    name = (given[-1].partition("=")[2] if given else None) or (following[-1] if following else DEFAULT_AGENT)
+    name = value_given("--agent", args)
     return name if name in AGENTS else DEFAULT_AGENT
+
+
+def value_given(option: str, args: Sequence[str]) -> str | None:
+    """The last value of an option in a command line, as "--option VALUE" or "--option=VALUE"; None without one."""
+    joined_to = f"{option}="
+    values = [
+        each.removeprefix(joined_to) if each.startswith(joined_to) else after
+        for each, after in pairwise([*args, ""])
+        if each == option or each.startswith(joined_to)
+    ]
+    return values[-1] if values else None
 
 
 def with_settings(command: Callable[..., None], agent: str = DEFAULT_AGENT) -> Callable[..., None]:

@@ -6,16 +6,19 @@ environment of their own. What is missing is left out, and said.
 
 import importlib.util
 import os
+import shutil
+import subprocess
 import sys
 import tempfile
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
 
 os.environ.setdefault("MUJOCO_GL", "disable")  # nothing is drawn
 
 import gymnasium as gym
 import numpy as np
-import yaml
 from gymnasium import wrappers
 
 from gym_dgpmpc import DGPMPCAgent
@@ -67,30 +70,67 @@ def episode(env):
     return f"{agent.task.describe()}; {agent.observation_space.shape[0]} numbers"
 
 
-def zoo(policy):
-    """rl_zoo3's train.py, with an evaluation."""
-    import rl_zoo3.exp_manager
-    import rl_zoo3.train
+QUICK = {name: value for name, value in TINY.items() if name != "seed"} | {"learning_starts": LENGTH}
 
-    for algorithms in (rl_zoo3.ALGOS, rl_zoo3.exp_manager.ALGOS, rl_zoo3.train.ALGOS):
-        algorithms["dgp_mpc"] = DGPMPCAgent
-    settings = {**TINY, "policy": policy, "n_timesteps": 2 * LENGTH, "learning_starts": LENGTH}
-    del settings["seed"]
+
+def zoo(algorithm):
+    """The commands of the RL Zoo: train, enjoy, plot, search; and what is trained to a hub that is a folder."""
+    flags, quick = f"--algo {algorithm} --env Pendulum-v1", [f"{name}:{value!r}" for name, value in QUICK.items()]
+    steps = f"--eval-freq {LENGTH} --eval-episodes 2 -n {2 * LENGTH}"
+    environment = {**os.environ, "MPLBACKEND": "agg"}
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "settings.yml"
-        file.write_text(yaml.safe_dump({"Pendulum-v1": settings}))
-        flags = "--algo dgp_mpc --env Pendulum-v1 --seed 0 --eval-freq 15 --eval-episodes 1 --n-eval-envs 1 --verbose 0"
-        sys.argv = ["train.py", *flags.split(), "--conf-file", str(file), "-f", folder]
-        rl_zoo3.train.train()
-        kept = sorted(path.name for path in Path(folder).rglob("*.zip"))
-    assert "Pendulum-v1.zip" in kept, kept
-    return f"trained, evaluated and saved: {', '.join(kept)}"
+
+        def run(command, *more):
+            command = [sys.executable, "-W", "ignore", "-m", "gym_dgpmpc.zoo", *command.split(), *more]
+            done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+            if done.returncode:
+                raise RuntimeError(f"{' '.join(command[5:9])}: {done.stderr.strip().splitlines()[-1]}")
+            return done.stdout
+
+        for seed in range(2):
+            run(f"train {flags} {steps} --seed {seed} -f logs -params", *quick)
+        enjoyed = run(f"enjoy {flags} -f logs -n 200 --no-render")
+        assert "Mean reward" in enjoyed, enjoyed
+        run("all_plots -e Pendulum-v1 -f logs -o all -a", algorithm)
+        assert (Path(folder) / "all.pkl").exists()
+        search = "-optimize --n-trials 2 --n-startup-trials 1 --n-evaluations 1 --no-optim-plots"
+        found = run(f"train {flags} {steps} {search} -f searched -params", *quick)
+        assert "Number of finished trials:  2" in found, found
+        downloaded = hub(Path(folder) / "hub", Path(folder) / "logs" / algorithm / "Pendulum-v1_2" / "Pendulum-v1.zip")
+        agent = DGPMPCAgent.load(downloaded, gym.make("Pendulum-v1"))
+        assert agent.is_fitted
+    return f"trained, plotted, searched, pushed and loaded; {enjoyed.strip().splitlines()[-2]}"
+
+
+def hub(folder, file):
+    """Push a file by huggingface_sb3 to a folder in the place of the Hub, and say where it was downloaded to."""
+    import huggingface_hub
+    import huggingface_sb3
+
+    def upload_file(self, path_or_fileobj, path_in_repo, repo_id, **_):
+        (folder / repo_id).mkdir(parents=True)
+        shutil.copy(path_or_fileobj, folder / repo_id / path_in_repo)
+
+    def create_repo(self, repo_id, **_):
+        return SimpleNamespace(repo_id=repo_id)
+
+    def hf_hub_download(repo_id, filename, **_):
+        return str(folder / repo_id / filename)
+
+    with (
+        mock.patch.object(huggingface_hub.HfApi, "create_repo", create_repo),
+        mock.patch.object(huggingface_hub.HfApi, "upload_file", upload_file),
+        mock.patch.object(huggingface_hub, "hf_hub_download", hf_hub_download),
+        mock.patch.dict(os.environ, TRUST_REMOTE_CODE="1"),
+    ):
+        huggingface_sb3.push_to_hub("me/dgp-mpc-Pendulum-v1", str(file), "first")
+        return huggingface_sb3.load_from_hub("me/dgp-mpc-Pendulum-v1", file.name)
 
 
 def main():
     warnings.simplefilter("ignore")
     wrong = 0
-    for package, function, cases in (("shimmy", dm_control, DM_CONTROL), ("rl_zoo3", zoo, ("MPCPolicy", "MlpPolicy"))):
+    for package, function, cases in (("shimmy", dm_control, DM_CONTROL), ("rl_zoo3", zoo, ("dgp-mpc",))):
         if importlib.util.find_spec(package) is None:
             print(f"{package} is not installed", flush=True)
             continue
