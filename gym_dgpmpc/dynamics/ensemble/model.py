@@ -6,7 +6,7 @@ networks are in `network.py`, the draws in `draws.py`.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -21,47 +21,27 @@ from gym_dgpmpc.dynamics.ensemble.network import (
     Prediction,
     half_precision,
     initial_ensemble,
-    layer_sizes,
     loss,
     misfit,
     predict,
 )
 from gym_dgpmpc.dynamics.gaussian_draws import GaussianSampler
 from gym_dgpmpc.dynamics.learner import Learner
+from gym_dgpmpc.dynamics.networks import Epochs, Learning, Parameters, Trained, layer_sizes, take_trained
 from gym_dgpmpc.dynamics.noise import NoiseSplit, observed, take_noise_split
 from gym_dgpmpc.dynamics.predictive import Mixture
-from gym_dgpmpc.dynamics.state import take_normaliser, take_tensors
-from gym_dgpmpc.inference.adam import adam_memory
+from gym_dgpmpc.dynamics.state import take_normaliser
 from gym_dgpmpc.types import ObservationSpec, StateDict, Transitions, TransitionSampler
 
 
-class _Moments(NamedTuple):
-    """What Adam remembers of one parameter between two trainings."""
-
-    first: Tensor
-    second: Tensor
-
-
 class _Fitted(NamedTuple):
-    network: Ensemble
+    trained: Trained
     inputs: Normaliser
-    moments: dict[str, _Moments]
-    num_updates: int  # Adam steps over all trainings
     noise: NoiseSplit | None = None  # None: not told apart
 
-
-class _Best(NamedTuple):
-    """The epoch of a training after which held-out data were likeliest, and the networks then."""
-
-    misfit: float
-    epoch: int
-    parameters: dict[str, Tensor]
-    moments: dict[str, _Moments]
-    num_updates: int
-
-
-HELD_OUT = 0.1
-"""The share of the transitions that ``patience`` holds out."""
+    @property
+    def network(self) -> Ensemble:
+        return Ensemble.from_parameters(self.trained.parameters)
 
 
 class EnsembleDynamics(Learner[_Fitted]):
@@ -124,29 +104,20 @@ class EnsembleDynamics(Learner[_Fitted]):
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ):
-        check_counts(
-            num_members=num_members,
-            num_hidden_layers=num_hidden_layers,
-            hidden_size=hidden_size,
-            batch_size=batch_size,
-            num_epochs=num_epochs,
-        )
-        if patience is not None:
-            check_counts(patience=patience)
+        check_counts(num_members=num_members, num_hidden_layers=num_hidden_layers, hidden_size=hidden_size)
+        self.epochs = Epochs(learning_rate, batch_size, num_epochs, patience)
+        self.epochs.check()
         if len(weight_decay) != num_hidden_layers + 1 or not all(0 <= decay < math.inf for decay in weight_decay):
             raise ValueError(
                 f"weight_decay must hold one number of at least 0 for each layer: {num_hidden_layers} for the hidden "
                 f"layers and one for the last, received {weight_decay}"
             )
-        if not 0 < learning_rate < math.inf:
-            raise ValueError(f"learning_rate must be positive, received {learning_rate}")
         if draw not in PROPAGATIONS:
             raise ValueError(f"unknown draw {draw!r}: expected one of {', '.join(PROPAGATIONS)}")
         noise = {"add_noise": add_noise, "split_noise": split_noise}
         super().__init__(observation_size, action_size, observation_spec, dtype, device, **noise)
-        self.num_members, self.weight_decay, self.learning_rate = num_members, tuple(weight_decay), learning_rate
-        self.batch_size, self.num_epochs, self.patience, self.draw_kind = batch_size, num_epochs, patience, draw
-        self.sizes = layer_sizes(self.encoder.input_size, num_hidden_layers, hidden_size, self.encoder.target_size)
+        self.num_members, self.weight_decay, self.draw_kind = num_members, tuple(weight_decay), draw
+        self.sizes = layer_sizes(self.encoder.input_size, num_hidden_layers, hidden_size, 2 * self.encoder.target_size)
         self.half_precision = half_precision
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
@@ -159,11 +130,12 @@ class EnsembleDynamics(Learner[_Fitted]):
         inputs = Normaliser.fit(raw, precision=data.observation.dtype)
         x, y = inputs(raw).float(), targets.float()
         if self._fitted is None:
-            network = initial_ensemble(self.num_members, self.sizes, generator, self.device)
-            moments, updates = dict[str, _Moments](), 0
+            initial = initial_ensemble(self.num_members, self.sizes, generator, self.device)
+            start = Trained.untrained(initial.parameters())
         else:
-            network, _, moments, updates, _ = self._fitted
-        trained, last_loss, iterations = self._train(network, moments, updates, inputs, x, y, generator)
+            start = self._fitted.trained
+        learning = self._train(start, x, y, generator)
+        trained = _Fitted(learning.trained, inputs)
 
         @torch.no_grad()
         def predicted(x: Tensor) -> Prediction:
@@ -174,8 +146,8 @@ class EnsembleDynamics(Learner[_Fitted]):
         noise = self._split_noise(data, normalisers, lambda x: predicted(x).mean.mean(0).double(), aleatoric)
         self._fitted = trained._replace(noise=noise)
         return {
-            "loss": last_loss,
-            "iterations": float(iterations),
+            "loss": learning.last_loss,
+            "iterations": float(learning.num_steps),
             "rmse": float((mean.mean(0) - y).square().mean().sqrt()),
             "aleatoric_std": float(torch.exp(0.5 * logvar).mean()),
             "disagreement": float(mean.std(0, correction=0).mean()),
@@ -235,11 +207,8 @@ class EnsembleDynamics(Learner[_Fitted]):
         """Networks, input normaliser and what Adam remembers; empty before the first fit."""
         if self._fitted is None:
             return {}
-        network, inputs, moments, num_updates, noise = self._fitted
-        state: StateDict = {**network.parameters(), "adam.num_updates": num_updates}
-        state |= {f"inputs.{key}": value for key, value in inputs._asdict().items()}
-        for name, pair in moments.items():
-            state |= {f"adam.{name}.{key}": value for key, value in pair._asdict().items()}
+        trained, inputs, noise = self._fitted
+        state = trained.state() | {f"inputs.{key}": value for key, value in inputs._asdict().items()}
         return state if noise is None else state | noise.state()
 
     def load_state_dict(self, state: StateDict) -> None:
@@ -252,84 +221,34 @@ class EnsembleDynamics(Learner[_Fitted]):
             self._fitted = None
             return
 
-        shapes = self._shapes()
-        device, single = self.device, torch.float32
-        network = Ensemble.from_parameters(take_tensors(state, shapes, device, single))
-        inputs = take_normaliser(state, "inputs", self.encoder.input_size, device)
-        moments = {
-            name: _Moments(
-                **take_tensors(state, dict.fromkeys(_Moments._fields, shape), device, single, prefix=f"adam.{name}.")
-            )
-            for name, shape in shapes.items()
-        }
-        num_updates = state.get("adam.num_updates")
-        if not isinstance(num_updates, int) or num_updates < 1:
-            raise ValueError(
-                f"dynamics state 'adam.num_updates': expected a positive integer, received {num_updates!r}"
-            )
-        noise = take_noise_split(state, self.encoder.target_size, device)
-        self._fitted = _Fitted(network, inputs, moments, num_updates, noise)
+        trained = take_trained(state, self._shapes(), self.device)
+        inputs = take_normaliser(state, "inputs", self.encoder.input_size, self.device)
+        self._fitted = _Fitted(trained, inputs, take_noise_split(state, self.encoder.target_size, self.device))
 
     def _train(
-        self,
-        network: Ensemble,
-        moments: dict[str, _Moments],
-        num_updates: int,
-        inputs: Normaliser,
-        x: Float[Tensor, "N D"],
-        y: Float[Tensor, "N T"],
-        generator: torch.Generator,
-    ) -> tuple[_Fitted, float, int]:
-        """Every member's own bootstrap, shuffled for each epoch; the mean loss of the last one, and the steps made."""
-        parameters = {name: value.clone().requires_grad_() for name, value in network.parameters().items()}
-        network = Ensemble.from_parameters(parameters)
-        # Adam's own decay adds decay * W to the gradient, the gradient of decay / 2 |W|^2, without a pass of its own.
-        groups: list[dict[str, Any]] = [
-            {"params": [weight], "weight_decay": decay}
-            for weight, decay in zip(network.weights, self.weight_decay, strict=True)
-        ]
-        groups.append({"params": [*network.biases, network.max_logvar, network.min_logvar]})
-        adam = torch.optim.Adam(groups, lr=self.learning_rate)
-        for name, parameter in parameters.items():
-            adam.state[parameter] = adam_memory(parameter, num_updates, moments.get(name))
-        learned, held_out = self._split(len(x), generator)
-        before = num_updates
+        self, start: Trained, x: Float[Tensor, "N D"], y: Float[Tensor, "N T"], generator: torch.Generator
+    ) -> Learning:
+        """Each member from its own bootstrap of the rows."""
+        learned, held_out = self.epochs.split(len(x), generator, self.device)
         chosen = torch.randint(len(learned), (self.num_members, len(learned)), generator=generator, device=x.device)
-        rows, best = learned[chosen], _Best(math.inf, 0, {}, {}, num_updates)
-        for epoch in range(self.num_epochs):
-            order = torch.rand(rows.shape, generator=generator, dtype=torch.float32, device=x.device).argsort(1)
-            losses = []
-            for batch in rows.gather(1, order).split(self.batch_size, dim=1):
-                with torch.enable_grad():
-                    value = loss(network, x[batch], y[batch])
-                adam.zero_grad()
-                value.backward()
-                adam.step()
-                losses.append(value.detach())
-                num_updates += 1
-            if self.on_progress is not None:
-                self.on_progress(epoch + 1, self.num_epochs, float(torch.stack(losses).mean()))
-            if held_out is None:
-                continue
-            with torch.no_grad():
-                tested = float(misfit(network, *(t[held_out].expand(self.num_members, -1, -1) for t in (x, y))).mean())
-            if tested < best.misfit:
-                best = _Best(tested, epoch, *_copies(parameters, adam), num_updates)
-            if epoch - best.epoch == self.patience:
-                break
-        if held_out is None or not best.parameters:  # no epoch was better than none: its loss was not finite
-            best = _Best(math.nan, epoch, *_copies(parameters, adam), num_updates)
-        trained = Ensemble.from_parameters(best.parameters)
-        fitted = _Fitted(trained, inputs, best.moments, best.num_updates)
-        return fitted, float(torch.stack(losses).mean()), num_updates - before
 
-    def _split(self, num_rows: int, generator: torch.Generator) -> tuple[Int[Tensor, "n"], Int[Tensor, "h"] | None]:
-        """Rows to learn from, and those held out; None where nothing is, for want of patience or of rows."""
-        count = int(HELD_OUT * num_rows)
-        if self.patience is None or count == 0:
-            return torch.arange(num_rows, dtype=torch.int64, device=self.device), None
-        order = torch.randperm(num_rows, generator=generator, device=self.device)
-        return order[count:], order[:count]
+        def of_batch(parameters: Parameters, batch: Int[Tensor, "B m"]) -> Float[Tensor, ""]:
+            return loss(Ensemble.from_parameters(parameters), x[batch], y[batch])
+
+        def of_held_out(parameters: Parameters) -> float:
+            tested = (rows[held_out].expand(self.num_members, -1, -1) for rows in (x, y))
+            return float(misfit(Ensemble.from_parameters(parameters), *tested).mean())
+
+        return self.epochs.train(
+            start,
+            learned[chosen],
+            of_batch,
+            None if held_out is None else of_held_out,
+            generator,
+            # Adam's own decay adds decay * W to the gradient, that of decay / 2 |W|^2, without a pass of its own.
+            options={f"layers.{i}.weight": {"weight_decay": decay} for i, decay in enumerate(self.weight_decay)},
+            on_progress=self.on_progress,
+        )
 
     def _shapes(self) -> dict[str, tuple[int, ...]]:
         """The shape of every parameter."""
@@ -338,17 +257,6 @@ class EnsembleDynamics(Learner[_Fitted]):
             shapes[f"layers.{i}.weight"] = (self.num_members, inputs, outputs)
             shapes[f"layers.{i}.bias"] = (self.num_members, 1, outputs)
         return shapes | dict.fromkeys(("max_logvar", "min_logvar"), (self.encoder.target_size,))
-
-
-def _copies(
-    parameters: Mapping[str, Tensor], adam: torch.optim.Optimizer
-) -> tuple[dict[str, Tensor], dict[str, _Moments]]:
-    """The parameters as they are now, and what Adam remembers of them."""
-    moments = {
-        name: _Moments(adam.state[value]["exp_avg"].clone(), adam.state[value]["exp_avg_sq"].clone())
-        for name, value in parameters.items()
-    }
-    return {name: value.detach().clone() for name, value in parameters.items()}, moments
 
 
 def _unit(size: int, device: torch.device) -> Normaliser:

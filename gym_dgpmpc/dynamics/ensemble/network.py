@@ -5,13 +5,14 @@ initial values, bounds and losses of their published code. `model.py` trains it 
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
+
+from gym_dgpmpc.dynamics.networks import Parameters, initial_weight, layers_of, named_layers
 
 MAX_LOGVAR, MIN_LOGVAR = 0.5, -10.0
 """Where the learned bounds of the predicted log variance start."""
@@ -30,20 +31,15 @@ class Ensemble(NamedTuple):
     max_logvar: Float[Tensor, "T"]
     min_logvar: Float[Tensor, "T"]
 
-    def parameters(self) -> dict[str, Tensor]:
+    def parameters(self) -> Parameters:
         """Every tensor by name."""
-        layers = enumerate(zip(self.weights, self.biases, strict=True))
-        named = {
-            f"layers.{i}.{name}": value for i, pair in layers for name, value in zip(_LAYER_FIELDS, pair, strict=True)
-        }
-        return named | {"max_logvar": self.max_logvar, "min_logvar": self.min_logvar}
+        bounds = {"max_logvar": self.max_logvar, "min_logvar": self.min_logvar}
+        return named_layers(self.weights, self.biases) | bounds
 
     @classmethod
-    def from_parameters(cls, named: dict[str, Tensor]) -> "Ensemble":
+    def from_parameters(cls, named: Parameters) -> "Ensemble":
         """The inverse of `parameters`."""
-        count = sum(name.endswith(".weight") for name in named)
-        weights, biases = (tuple(named[f"layers.{i}.{name}"] for i in range(count)) for name in _LAYER_FIELDS)
-        return cls(weights, biases, named["max_logvar"], named["min_logvar"])
+        return cls(*layers_of(named), named["max_logvar"], named["min_logvar"])
 
     def at(self, members: Int[Tensor, "C"]) -> "Ensemble":
         """Copies of these members, each as often as it is named."""
@@ -51,26 +47,11 @@ class Ensemble(NamedTuple):
         return self._replace(weights=weights, biases=biases)
 
 
-_LAYER_FIELDS = ("weight", "bias")
-
-
-def layer_sizes(
-    input_size: int, num_hidden_layers: int, hidden_size: int, num_targets: int
-) -> tuple[tuple[int, int], ...]:
-    """Inputs and outputs of every layer; the last gives T means and T log variances."""
-    widths = [input_size, *[hidden_size] * num_hidden_layers, 2 * num_targets]
-    return tuple(pairwise(widths))
-
-
 def initial_ensemble(
     num_members: int, sizes: Sequence[tuple[int, int]], generator: torch.Generator, device: torch.device
 ) -> Ensemble:
-    """Weights from a normal of standard deviation 1 / (2 sqrt(inputs)), cut off at twice that; biases zero."""
-    weights = []
-    for inputs, outputs in sizes:
-        weight = torch.empty(num_members, inputs, outputs, dtype=torch.float32, device=device)
-        std = 0.5 * inputs**-0.5
-        weights.append(torch.nn.init.trunc_normal_(weight, 0.0, std, -2 * std, 2 * std, generator=generator))
+    """Weights by `initial_weight`; biases zero; the last layer gives T means and T log variances."""
+    weights = [initial_weight(inputs, outputs, generator, device, num_members) for inputs, outputs in sizes]
     biases = [torch.zeros(num_members, 1, outputs, dtype=torch.float32, device=device) for _, outputs in sizes]
     num_targets = sizes[-1][1] // 2
     bounds = (

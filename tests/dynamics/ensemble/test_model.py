@@ -16,10 +16,10 @@ from gym_dgpmpc.dynamics.ensemble.network import (
     Ensemble,
     half_precision,
     initial_ensemble,
-    layer_sizes,
     loss,
     predict,
 )
+from gym_dgpmpc.dynamics.networks import layer_sizes
 from tests.oracles import pendulum
 from tests.oracles.models import seeded
 
@@ -31,7 +31,7 @@ def small(**settings):
 
 
 def network(num_members=3, generator=None):
-    return initial_ensemble(num_members, layer_sizes(4, 2, 7, 2), generator or seeded(), torch.device("cpu"))
+    return initial_ensemble(num_members, layer_sizes(4, 2, 7, 4), generator or seeded(), torch.device("cpu"))
 
 
 def by_hand(parameters, member, x):
@@ -69,7 +69,7 @@ def test_points_beyond_the_cache_are_taken_in_parts(monkeypatch):
 
 def test_weights_start_truncated_and_biases_at_zero():
     """A normal cut off at two standard deviations has 0.8796 of them left."""
-    ensemble = initial_ensemble(5, layer_sizes(100, 1, 200, 4), seeded(), torch.device("cpu"))
+    ensemble = initial_ensemble(5, layer_sizes(100, 1, 200, 8), seeded(), torch.device("cpu"))
     (first, _), std = ensemble.weights, 0.5 * 100**-0.5
     assert first.shape == (5, 100, 200)
     assert float(first.abs().max()) <= 2 * std
@@ -213,7 +213,7 @@ def test_any_number_of_particles_will_do(draw):
 
 def test_half_precision_is_off_by_its_rounding():
     """bfloat16 rounds to 8 bits, 2^-9 relative, in each of the inputs, weights and results of the middle layer."""
-    ensemble = initial_ensemble(3, layer_sizes(4, 3, 200, 2), seeded(), torch.device("cpu"))
+    ensemble = initial_ensemble(3, layer_sizes(4, 3, 200, 4), seeded(), torch.device("cpu"))
     x = torch.randn(3, 50, 4, generator=seeded(1))
     with torch.no_grad():
         exact, rounded = predict(ensemble, x.clone()), predict(half_precision(ensemble), x.clone())
