@@ -19,6 +19,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from benchmarks.tasks import Task
 from gym_dgpmpc.agents import (
+    DeepPILCOAgent,
     DGPMPCAgent,
     GPMPCAgent,
     MCPILCOAgent,
@@ -266,6 +267,7 @@ ALL_METHODS: tuple[Method, ...] = (
     PlanningMethod(
         "MC-PILCO DGP L=2", MCPILCOAgent, _of(presets.POLICY_SEARCH), {"num_layers": 2, "kernel": "matern32"}
     ),
+    PlanningMethod("DeepPILCO", DeepPILCOAgent, _of(presets.POLICY_SEARCH)),
     PlanningMethod("PILCO", PILCOAgent, _of(presets.POLICY_SEARCH)),
     PlanningMethod("true dynamics", true_dynamics_agent, _planning_alone),
     ModelFreeMethod("SAC", SAC, _off_policy),

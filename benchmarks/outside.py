@@ -26,7 +26,7 @@ from torch import Tensor
 from benchmarks import RESULTS
 from benchmarks.report import markdown
 from benchmarks.rows import Row, made_by, measure_missing
-from gym_dgpmpc import DGPMPCAgent, MCPILCOAgent, PILCOAgent
+from gym_dgpmpc import DeepPILCOAgent, DGPMPCAgent, MCPILCOAgent, PILCOAgent
 from gym_dgpmpc.agents import MPCAgent
 from gym_dgpmpc.runs.provenance import revision
 from gym_dgpmpc.types import ObservationSpec
@@ -117,6 +117,7 @@ METHODS: Mapping[str, Callable[..., MPCAgent]] = MappingProxyType(
         "DGP-MPC": DGPMPCAgent,
         "MC-PILCO": MCPILCOAgent,
         "MC-PILCO, deep GP": partial(MCPILCOAgent, num_layers=2, kernel="matern32"),
+        "DeepPILCO": DeepPILCOAgent,
         "PILCO": PILCOAgent,
     }
 )

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from gym_dgpmpc.envs.registration import CLASSES, import_public, register_environments
 
 if TYPE_CHECKING:
+    from gym_dgpmpc.agents import DeepPILCOAgent as DeepPILCOAgent
     from gym_dgpmpc.agents import DGPMPCAgent as DGPMPCAgent
     from gym_dgpmpc.agents import DynaAgent as DynaAgent
     from gym_dgpmpc.agents import GPMPCAgent as GPMPCAgent
@@ -24,6 +25,7 @@ _MODULE_OF = {
     **dict.fromkeys(
         (
             "DGPMPCAgent",
+            "DeepPILCOAgent",
             "DynaAgent",
             "GPMPCAgent",
             "MCPILCOAgent",

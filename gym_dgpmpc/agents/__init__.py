@@ -1,5 +1,6 @@
 """The agents: model-predictive control as Stable-Baselines3 algorithms, and the named methods made of its parts."""
 
+from gym_dgpmpc.agents.deep_pilco import DeepPILCOAgent
 from gym_dgpmpc.agents.dgp_mpc import DGPMPCAgent
 from gym_dgpmpc.agents.dyna import DynaAgent
 from gym_dgpmpc.agents.gp_mpc import GPMPCAgent
@@ -11,6 +12,7 @@ from gym_dgpmpc.agents.pilco import PILCOAgent
 
 __all__ = [
     "DGPMPCAgent",
+    "DeepPILCOAgent",
     "DynaAgent",
     "GPMPCAgent",
     "MCPILCOAgent",

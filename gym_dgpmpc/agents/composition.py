@@ -38,13 +38,13 @@ class MadeOf(NamedTuple):
     Attributes:
         name: of the class.
         dynamics_class: the model that it makes, or None if it is given one.
-        planner_defaults: the planner's settings that differ from the planner's own defaults.
+        part_defaults: settings of its parts that differ from the parts' own defaults.
         controller_class: what acts through model and planner.
     """
 
     name: str
     dynamics_class: Callable[..., DynamicsModel] | None
-    planner_defaults: Mapping[str, Any]
+    part_defaults: Mapping[str, Any]
     controller_class: type[Controller] = Controller
 
 
@@ -130,7 +130,7 @@ class Composition:
             )
         known = part_settings(agent, planner)
         refuse_unknown(agent.name, settings, {**known, **other_names})
-        defaults = {name: agent.planner_defaults.get(name, setting.default) for name, setting in known.items()}
+        defaults = {name: agent.part_defaults.get(name, setting.default) for name, setting in known.items()}
         self.settings: Mapping[str, Any] = MappingProxyType({**defaults, **settings})
 
     @property

@@ -160,8 +160,8 @@ class MPCAgent(BaseAlgorithm):
     """Of a named agent, the model that it is made of; its settings are arguments of the agent."""
     controller_class: ClassVar[type[Controller]] = Controller
     """What acts through model and planner; its settings are arguments of the agent."""
-    planner_defaults: ClassVar[Mapping[str, Any]] = MappingProxyType({})
-    """Of a named agent, the planner's settings that differ from the planner's own defaults."""
+    part_defaults: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+    """Of a named agent, the settings of its parts that differ from the parts' own defaults."""
     largest: ClassVar[Mapping[str, int]] = MappingProxyType({"num_particles": 10**4})
     """What a file may claim; see `settings_of`."""
 
@@ -246,7 +246,7 @@ class MPCAgent(BaseAlgorithm):
     @classmethod
     def made_of(cls) -> MadeOf:
         """What this class says of its parts."""
-        return MadeOf(cls.__name__, cls.dynamics_class, cls.planner_defaults, cls.controller_class)
+        return MadeOf(cls.__name__, cls.dynamics_class, cls.part_defaults, cls.controller_class)
 
     @classmethod
     def own_settings(cls) -> dict[str, Setting]:

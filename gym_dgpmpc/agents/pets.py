@@ -32,7 +32,7 @@ class PETSAgent(PETSAgentBase):
     """
 
     dynamics_class = EnsembleDynamics
-    planner_defaults = MappingProxyType({"horizon": 25, "num_candidates": 400})
+    part_defaults = MappingProxyType({"horizon": 25, "num_candidates": 400})
 
     if not TYPE_CHECKING:  # to whom the base says all of it
 

@@ -94,9 +94,9 @@ def composed_signature(agent: type, own: Settings, *of_parts: Settings) -> inspe
         inspect.Parameter("policy", keyword, default="MPCPolicy", annotation=base["policy"].annotation),
         inspect.Parameter("env", keyword, default=None, annotation=base["env"].annotation),
     ]
-    planner_defaults = getattr(agent, "planner_defaults", {})
+    part_defaults = getattr(agent, "part_defaults", {})
     for setting in joined(*of_parts, own).values():
-        parameters.append(setting.parameter(planner_defaults.get(setting.name, setting.default)))
+        parameters.append(setting.parameter(part_defaults.get(setting.name, setting.default)))
     parameters += [base[name].replace(default="cem" if name == "planner" else base[name].default) for name in NOT_PLAIN]
     if agent is _base(agent):  # takes any model, and any planner's settings
         parameters.insert(2, base["dynamics"].replace(kind=keyword))

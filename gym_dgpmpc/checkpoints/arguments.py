@@ -27,6 +27,7 @@ AGENT_CLASSES = {
     "DynaAgent": "gym_dgpmpc.agents.dyna",
     "MixtureMPCAgent": "gym_dgpmpc.agents.mixture",
     "MCPILCOAgent": "gym_dgpmpc.agents.mc_pilco",
+    "DeepPILCOAgent": "gym_dgpmpc.agents.deep_pilco",
     "PILCOAgent": "gym_dgpmpc.agents.pilco",
 }
 """The classes that a file may name, and where they are; nothing else is ever imported for a file."""

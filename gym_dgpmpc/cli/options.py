@@ -15,7 +15,16 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 
 import typer
 
-from gym_dgpmpc.agents import DGPMPCAgent, DynaAgent, MCPILCOAgent, MixtureMPCAgent, MPCAgent, PILCOAgent, presets
+from gym_dgpmpc.agents import (
+    DeepPILCOAgent,
+    DGPMPCAgent,
+    DynaAgent,
+    MCPILCOAgent,
+    MixtureMPCAgent,
+    MPCAgent,
+    PILCOAgent,
+    presets,
+)
 from gym_dgpmpc.agents.composition import model_settings
 from gym_dgpmpc.cli.request import DEFAULT_AGENT
 from gym_dgpmpc.cli.train import RUN
@@ -36,6 +45,7 @@ AGENTS: dict[str, Trained] = {
     "dyna": Trained(DynaAgent, presets.settings_for),
     "mixture": Trained(MixtureMPCAgent, presets.mixture_settings_for),
     "mc-pilco": Trained(MCPILCOAgent, presets.policy_search_settings_for),
+    "deep-pilco": Trained(DeepPILCOAgent, presets.policy_search_settings_for),
     "pilco": Trained(PILCOAgent, presets.policy_search_settings_for),
 }
 """By name. Their settings of the same name, which are one option, mean the same."""

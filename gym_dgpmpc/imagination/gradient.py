@@ -14,6 +14,7 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import Tensor
 
+from gym_dgpmpc.dynamics.gaussian_draws import match_moments
 from gym_dgpmpc.errors import NotDifferentiableError
 from gym_dgpmpc.imagination.worlds import ImaginedVecEnv
 
@@ -126,13 +127,23 @@ class Paths:
         num_paths: K, in each of its n worlds.
         action_noise: standard deviation of the noise on actions, of half their range.
         goes_on: share of the paths that begin where the last ones ended.
+        matches_moments: after each step all states of paths that go on are replaced by draws from the Gaussian with
+            their means and variances, as DeepPILCO does; gradients come through both. A reward sees the new next state
+            beside a state that it does not follow from.
     """
 
     def __init__(
-        self, env: ImaginedVecEnv, horizon: int, num_paths: int, action_noise: float, goes_on: float = GOES_ON
+        self,
+        env: ImaginedVecEnv,
+        horizon: int,
+        num_paths: int,
+        action_noise: float,
+        goes_on: float = GOES_ON,
+        *,
+        matches_moments: bool = False,
     ):
         self._env, self._horizon, self._num_paths, self._action_noise = env, horizon, num_paths, action_noise
-        self._share_that_goes_on = goes_on
+        self._share_that_goes_on, self._matches_moments = goes_on, matches_moments
         self.num_steps = horizon * num_paths * env.num_envs
         """Imagined steps of all paths together."""
         self._states: Float[Tensor, "n K S_all"] | None = None
@@ -155,8 +166,12 @@ class Paths:
             lost = env.left(after) & alive
             # What is lost has no gradient; in its place a state that keeps what comes after it finite.
             after = torch.where((lost | ~alive).unsqueeze(-1), states.detach(), after)
-            reward = env.reward_fn(states, action, after).to(states)
             earns = alive & ~lost
+            if self._matches_moments:
+                after = after.masked_scatter(
+                    earns.unsqueeze(-1), match_moments(after[earns].unsqueeze(1), env.generator)
+                )
+            reward = env.reward_fn(states, action, after).to(states)
             total = total + torch.where(earns, reward, torch.zeros_like(reward))
             total = total + lost * env.least_reward * (self._horizon - step)
             alive = earns if env.terminated_fn is None else earns & ~env.terminated_fn(after)

@@ -122,6 +122,9 @@ class SampledSearchController(PolicySearchController):
         search_steps: steps of the optimiser after each later one, which go on from the policy before.
         search_step_size: of the optimiser's first step; it falls to a tenth.
         policy_dropout: chance that a basis function is left out at first; it falls to zero over a search.
+        match_moments: after each step of a search, replace all particles by draws from the Gaussian with their means
+            and variances. The model is then to tell no observation noise apart: a new particle has no error of its own
+            that could be undone.
         **policy: the settings of `PolicySearchController`.
 
     Raises:
@@ -149,6 +152,7 @@ class SampledSearchController(PolicySearchController):
         search_steps: int = 300,
         search_step_size: float = 0.03,
         policy_dropout: float = 0.25,
+        match_moments: bool = False,
         device: torch.device | str = "cpu",
         **policy: Any,
     ):
@@ -164,6 +168,7 @@ class SampledSearchController(PolicySearchController):
         self.num_worlds, self.num_paths = num_worlds, num_paths
         self.first_search_steps, self.search_steps = first_search_steps, search_steps
         self.search_step_size, self.policy_dropout = search_step_size, policy_dropout
+        self.match_moments = match_moments
 
     def improve(self, agent: Imagining, seed: int) -> Mapping[str, float]:
         """Search on from the present policy.
@@ -176,7 +181,9 @@ class SampledSearchController(PolicySearchController):
         )
         num_steps = self.first_search_steps if self.policy is None else self.search_steps
         policy = self._first_policy(agent, seed) if self.policy is None else self.policy
-        found = SampledSearch(self.num_paths, num_steps, self.search_step_size, self.policy_dropout)
+        found = SampledSearch(
+            self.num_paths, num_steps, self.search_step_size, self.policy_dropout, self.match_moments
+        )
         with torch.enable_grad():
             metrics = found.improve(policy, worlds)
         self.policy = policy

@@ -1,7 +1,8 @@
 """Policy search through sampled worlds: particles live whole episodes, and their mean reward has a gradient.
 
 Amadio et al. (2022), "Model-Based Policy Search Using Monte Carlo Gradient Estimation With Real Systems Application"
-(MC-PILCO). What differs is in docs/deviations.md.
+(MC-PILCO); with moments matched at each step, Gal, McAllister and Rasmussen (2016), "Improving PILCO with Bayesian
+Neural Network Dynamics Models" (DeepPILCO). What differs is in docs/deviations.md.
 """
 
 from typing import NamedTuple
@@ -52,12 +53,14 @@ class SampledSearch(NamedTuple):
         num_steps: steps of the optimiser, Adam.
         step_size: of its first step.
         dropout: chance that a basis function is left out at the first step; it falls to zero, linearly.
+        matches_moments: see `Paths`.
     """
 
     num_paths: int
     num_steps: int
     step_size: float
     dropout: float
+    matches_moments: bool = False
 
     def improve(self, policy: SquashedPolicy, worlds: ImaginedVecEnv) -> dict[str, float]:
         """Let the policy climb its mean reward over episodes in the worlds, which are drawn anew for each step.
@@ -65,7 +68,10 @@ class SampledSearch(NamedTuple):
         Raises:
             NotDifferentiableError: no gradient comes through the reward, or through the model's draws.
         """
-        paths = Paths(worlds, worlds.episode_steps, self.num_paths, action_noise=0.0, goes_on=0.0)
+        paths = Paths(
+            worlds, worlds.episode_steps, self.num_paths, action_noise=0.0, goes_on=0.0,
+            matches_moments=self.matches_moments,
+        )  # fmt: skip
         acting = Dropped(policy, worlds.generator)
         optimiser = torch.optim.Adam(policy.parameters(), lr=self.step_size)
         earned = []

@@ -67,7 +67,7 @@ def test_signature_documentation_and_file_follow_the_parts(agent_class, tmp_path
     made.save(tmp_path / "agent")
     saved = read_checkpoint(tmp_path / "agent").config["arguments"]
     for name, setting in parts.items():
-        default = agent_class.planner_defaults.get(name, setting.default)
+        default = agent_class.part_defaults.get(name, setting.default)
         assert parameters[name].default == default
         assert made.settings[name] == getattr(made, name) == default
         assert (name in saved) == setting.is_saved

@@ -73,8 +73,8 @@ def test_defaults_of_an_agent_are_its_own(tmp_path):
     """PETS plans with other numbers than CEM's own."""
     agent = PETSAgent("ToyPush-v0", seed=0)
     settings = inspected(agent, tmp_path)["settings"]
-    assert PETSAgent.planner_defaults
-    for name, value in PETSAgent.planner_defaults.items():
+    assert PETSAgent.part_defaults
+    for name, value in PETSAgent.part_defaults.items():
         assert settings[name] == {"value": value, "default": value, "differs": False}
 
 

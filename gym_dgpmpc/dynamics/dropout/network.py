@@ -89,7 +89,7 @@ def misfit(
 
 
 def decays(num_layers: int, rate: float, lengthscale: float, num_rows: int) -> Mapping[str, Mapping[str, Any]]:
-    """Adam's decay of each parameter, l^2 / N for biases and q l^2 / N for weights, q being what of their inputs is kept.
+    """Adam's decay of each parameter: l^2 / N for biases, q l^2 / N for weights of whose inputs the share q is kept.
 
     Decay / 2 |W|^2 is then the divergence from the prior, up to a constant, over the N rows that `misfit` is a mean
     over (their eq. 6 and appendix 4.2, with 1/tau the noise's variance).
