@@ -207,8 +207,8 @@ POLICY_SEARCH = MappingProxyType(
         "SwingUpCartPole-v0": MappingProxyType({"exploration": "held", "search_horizon": 75}),
     }
 )
-"""Settings of `MCPILCOAgent`, `DeepPILCOAgent` and `PILCOAgent` that spare time: they search by the first three of these
-tasks' eight seconds, in which a pole can be swung up. Nothing was measured with them."""
+"""Settings of `MCPILCOAgent`, `DeepPILCOAgent` and `PILCOAgent` that spare time: they search by the first three of
+these tasks' eight seconds, in which a pole can be swung up. Nothing was measured with them."""
 
 
 def policy_search_settings_for(env_id: str) -> Mapping[str, Any]:

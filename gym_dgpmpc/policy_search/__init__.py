@@ -1,4 +1,4 @@
-"""Policy search, as PILCO and its successors have it: a policy of few parameters climbs its return through the model."""
+"""Policy search, of PILCO and its successors: a policy of few parameters climbs its return through the model."""
 
 from gym_dgpmpc.policy_search.controller import MomentSearchController, SampledSearchController
 from gym_dgpmpc.policy_search.policies import PolicyForm, SquashedPolicy

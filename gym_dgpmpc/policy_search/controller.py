@@ -181,9 +181,7 @@ class SampledSearchController(PolicySearchController):
         )
         num_steps = self.first_search_steps if self.policy is None else self.search_steps
         policy = self._first_policy(agent, seed) if self.policy is None else self.policy
-        found = SampledSearch(
-            self.num_paths, num_steps, self.search_step_size, self.policy_dropout, self.match_moments
-        )
+        found = SampledSearch(self.num_paths, num_steps, self.search_step_size, self.policy_dropout, self.match_moments)
         with torch.enable_grad():
             metrics = found.improve(policy, worlds)
         self.policy = policy

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
+from gym_dgpmpc.dynamics.dropout import DropoutDynamics
 from gym_dgpmpc.dynamics.ensemble.draws import PROPAGATIONS
 from gym_dgpmpc.dynamics.ensemble.model import EnsembleDynamics
 from gym_dgpmpc.dynamics.mixture import MixtureDynamics
@@ -61,6 +62,8 @@ def _cases():
     for draw in PROPAGATIONS:
         settings = {**NETWORKS, "draw": draw}
         cases[f"ensemble-{draw}"] = of("ensemble", EnsembleDynamics, settings, *shape, is_random=draw != "expectation")
+    dropout = {"num_hidden_layers": 2, "hidden_size": 8, "num_epochs": 5}
+    cases["dropout"] = of("dropout", DropoutDynamics, dropout, *shape)
     for draw in GP_DRAWS:
         cases[f"sparse-{draw}"] = of("sparse", SparseGPDynamics, {"num_inducing": 30, "draw": draw}, *shape)
     cases["exact-DS"] = of("exact", SparseGPDynamics, {"exact": True, "draw": "DS"}, *shape)
@@ -82,7 +85,7 @@ FAMILIES = {case.family: name for name, case in CASES.items()}  # one case of ea
 LEARNERS = [name for family, name in FAMILIES.items() if family != "truth"]
 OF_ONE_KIND = [name for name in LEARNERS if name != "mixture"]
 """Those whose noise is theirs: that of a mixture is its members'."""
-GAUSSIAN_PROCESSES = [name for name, case in CASES.items() if case.family not in ("truth", "ensemble", "mixture")]
+GAUSSIAN_PROCESSES = [name for name, case in CASES.items() if case.family.startswith(("sparse", "exact", "deep"))]
 
 
 @functools.cache

@@ -79,9 +79,7 @@ def predict(network: DropoutNetwork, kept: Kept, x: Float[Tensor, "*b D"]) -> Fl
     return x @ weight + bias
 
 
-def misfit(
-    network: DropoutNetwork, kept: Kept, x: Float[Tensor, "n D"], y: Float[Tensor, "n T"]
-) -> Float[Tensor, ""]:
+def misfit(network: DropoutNetwork, kept: Kept, x: Float[Tensor, "n D"], y: Float[Tensor, "n T"]) -> Float[Tensor, ""]:
     """Mean negative log likelihood of a row, up to a constant: sum_t [(y - f(x))^2 / (2 s_t^2) + log(s_t^2) / 2]."""
     variance = network.noise_variance
     by_target = (y - predict(network, kept, x)).square() / variance + variance.log()
