@@ -16,7 +16,7 @@ from gym_dgpmpc.agents.signature import PLAIN
 from gym_dgpmpc.planning.controller import Controller
 from gym_dgpmpc.planning.registry import PlannerName, is_ready_made, make_planner, planner_factory
 from gym_dgpmpc.planning.risk import RiskMeasure
-from gym_dgpmpc.settings import Setting, joined, refuse_unknown, settings_of
+from gym_dgpmpc.settings import Setting, Settings, joined, refuse_unknown, settings_of
 from gym_dgpmpc.types import DynamicsFactory, DynamicsModel, ObservationSpec, Planner, PlannerFactory
 
 AnyPlanner = PlannerName | str | PlannerFactory | Planner
@@ -64,14 +64,27 @@ def own_settings(base: Callable[..., Any], agent: type) -> dict[str, Setting]:
 
 
 def part_settings(agent: MadeOf, planner: AnyPlanner) -> dict[str, Setting]:
-    """The settings of an agent's model and controller, and of its planner unless that is a ready-made one."""
+    """The settings of an agent's model and controller, and of its planner unless that is a ready-made one.
+
+    Their defaults are the agent's own.
+    """
     of_planner = {} if is_ready_made(planner) else settings_of(planner_factory(planner))
-    return joined(model_settings(agent), settings_of(agent.controller_class), of_planner)
+    return joined(model_settings(agent), controller_settings(agent), _with_own_defaults(agent, of_planner))
 
 
 def model_settings(agent: MadeOf) -> dict[str, Setting]:
     """The settings of the model that a named agent makes; none of a plain `MPCAgent`."""
-    return {} if agent.dynamics_class is None else settings_of(agent.dynamics_class)
+    return {} if agent.dynamics_class is None else _with_own_defaults(agent, settings_of(agent.dynamics_class))
+
+
+def controller_settings(agent: MadeOf) -> dict[str, Setting]:
+    """The settings of an agent's controller."""
+    return _with_own_defaults(agent, settings_of(agent.controller_class))
+
+
+def _with_own_defaults(agent: MadeOf, settings: Settings) -> dict[str, Setting]:
+    changed = agent.part_defaults
+    return {name: replace(setting, default=changed.get(name, setting.default)) for name, setting in settings.items()}
 
 
 def setting_property(name: str) -> property:
@@ -130,7 +143,7 @@ class Composition:
             )
         known = part_settings(agent, planner)
         refuse_unknown(agent.name, settings, {**known, **other_names})
-        defaults = {name: agent.part_defaults.get(name, setting.default) for name, setting in known.items()}
+        defaults = {name: setting.default for name, setting in known.items()}
         self.settings: Mapping[str, Any] = MappingProxyType({**defaults, **settings})
 
     @property
@@ -154,7 +167,7 @@ class Composition:
         Raises:
             ValueError, TypeError: see `registry.make_planner`.
         """
-        of_others = {**model_settings(self._agent), **settings_of(self._agent.controller_class)}
+        of_others = {**model_settings(self._agent), **controller_settings(self._agent)}
         own = {name: value for name, value in self.settings.items() if name not in of_others}
         return make_planner(self.planner, action_space, device, **own)
 
@@ -170,7 +183,7 @@ class Composition:
         Raises:
             ValueError, TypeError: see `registry.make_planner` and the class of the controller.
         """
-        own = {name: self.settings[name] for name in settings_of(self._agent.controller_class)}
+        own = {name: self.settings[name] for name in controller_settings(self._agent)}
         planner = self.make_planner(action_space, device)
         return self._agent.controller_class(dynamics, planner, action_space, *planning, **own, device=device)
 

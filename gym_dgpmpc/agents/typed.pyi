@@ -161,6 +161,128 @@ class DGPMPCAgentBase(MPCAgent):
     @property
     def min_std(self) -> float: ...
 
+class DeepPILCOAgentBase(PolicyAgent):
+    def __init__(
+        self,
+        *args: str | type[BasePolicy] | Env | VecEnv | None,
+        policy: str | type[BasePolicy] = "MPCPolicy",
+        env: Env | VecEnv | str | None = None,
+        num_hidden_layers: int = 2,
+        hidden_size: int = 200,
+        dropout: float = 0.05,
+        prior_lengthscale: float = 1.0,
+        model_noise_std: float | None = None,
+        learning_rate: float = 0.001,
+        batch_size: int = 100,
+        num_epochs: int = 1000,
+        patience: int | None = None,
+        add_noise: bool = True,
+        split_noise: bool = False,
+        num_worlds: int = 50,
+        num_paths: int = 1,
+        first_search_steps: int = 300,
+        search_steps: int = 300,
+        search_step_size: float = 0.03,
+        policy_dropout: float = 0.0,
+        match_moments: bool = True,
+        policy_form: Literal["rbf", "linear"] = "rbf",
+        num_centres: int = 50,
+        search_horizon: int | None = None,
+        horizon: int = 30,
+        num_candidates: int = 300,
+        num_elites: int | None = None,
+        num_iterations: int = 5,
+        smoothing: float = 0.1,
+        min_std: float = 0.005,
+        num_particles: int = 5,
+        actions_per_plan: int = 1,
+        risk: Literal["mean", "mean-std", "cvar", "worst", "best"] = "mean",
+        risk_aversion: float = 1.0,
+        cvar_share: float = 0.2,
+        learning_starts: int | None = None,
+        exploration: Literal["uniform", "held", "coloured", "chirp"] = "uniform",
+        exploration_hold: int = 5,
+        exploration_beta: float = 1.0,
+        train_freq: int | None = None,
+        observation_spec: ObservationSpec | None = None,
+        time_budget: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | PathLike[str] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        planner: Literal["cem", "icem", "mppi", "gradient"] | str | Callable[..., Planner] | Planner | None = "cem",
+        reward_fn: RewardFn | Literal["learned"] | None = None,
+        terminated_fn: TerminatedFn | Literal["learned"] | Literal["never"] | None = None,
+        first_controller: Callable[[Any], Any] | None = None,
+        device: device | str = "cpu",
+        noise_beta: float = 0.25,
+        fraction_elites_reused: float = 0.3,
+        factor_decrease_num: float = 1.25,
+        start_std: float = 0.25,
+        temperature: float = 0.5,
+        standardise: bool = True,
+        noise_std: float = 0.25,
+        control_cost: float = 0.0,
+        num_starts: int = 4,
+        optimiser: Literal["adam", "lbfgs"] = "lbfgs",
+        action_step: float = 0.1,
+        start_from: Literal["plan", "cem"] = "plan",
+        cem_candidates: int = 100,
+        cem_iterations: int = 3,
+    ) -> None: ...
+    @property
+    def num_hidden_layers(self) -> int: ...
+    @property
+    def hidden_size(self) -> int: ...
+    @property
+    def dropout(self) -> float: ...
+    @property
+    def prior_lengthscale(self) -> float: ...
+    @property
+    def model_noise_std(self) -> float | None: ...
+    @property
+    def batch_size(self) -> int: ...
+    @property
+    def num_epochs(self) -> int: ...
+    @property
+    def patience(self) -> int | None: ...
+    @property
+    def add_noise(self) -> bool: ...
+    @property
+    def split_noise(self) -> bool: ...
+    @property
+    def num_worlds(self) -> int: ...
+    @property
+    def num_paths(self) -> int: ...
+    @property
+    def first_search_steps(self) -> int: ...
+    @property
+    def search_steps(self) -> int: ...
+    @property
+    def search_step_size(self) -> float: ...
+    @property
+    def policy_dropout(self) -> float: ...
+    @property
+    def match_moments(self) -> bool: ...
+    @property
+    def policy_form(self) -> Literal["rbf", "linear"]: ...
+    @property
+    def num_centres(self) -> int: ...
+    @property
+    def search_horizon(self) -> int | None: ...
+    @property
+    def horizon(self) -> int: ...
+    @property
+    def num_candidates(self) -> int: ...
+    @property
+    def num_elites(self) -> int | None: ...
+    @property
+    def num_iterations(self) -> int: ...
+    @property
+    def smoothing(self) -> float: ...
+    @property
+    def min_std(self) -> float: ...
+
 class DynaAgentBase(DGPMPCAgent):
     def __init__(
         self,
@@ -460,6 +582,7 @@ class MCPILCOAgentBase(PolicyAgent):
         search_steps: int = 300,
         search_step_size: float = 0.03,
         policy_dropout: float = 0.25,
+        match_moments: bool = False,
         policy_form: Literal["rbf", "linear"] = "rbf",
         num_centres: int = 100,
         search_horizon: int | None = None,
@@ -573,6 +696,8 @@ class MCPILCOAgentBase(PolicyAgent):
     def search_step_size(self) -> float: ...
     @property
     def policy_dropout(self) -> float: ...
+    @property
+    def match_moments(self) -> bool: ...
     @property
     def policy_form(self) -> Literal["rbf", "linear"]: ...
     @property

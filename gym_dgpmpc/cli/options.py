@@ -25,7 +25,7 @@ from gym_dgpmpc.agents import (
     PILCOAgent,
     presets,
 )
-from gym_dgpmpc.agents.composition import model_settings
+from gym_dgpmpc.agents.composition import controller_settings, model_settings
 from gym_dgpmpc.cli.request import DEFAULT_AGENT
 from gym_dgpmpc.cli.train import RUN
 from gym_dgpmpc.planning.registry import PLANNERS, planner_factory
@@ -107,12 +107,12 @@ def with_settings(command: Callable[..., None], agent: str = DEFAULT_AGENT) -> C
 def _options(agent: str) -> Iterable[inspect.Parameter]:
     seen: set[str] = set()
     made_of = AGENTS[agent].agent_class.made_of()
-    shown = {*model_settings(made_of), *settings_of(made_of.controller_class)}
+    shown = {*model_settings(made_of), *controller_settings(made_of)}
     own = MPCAgent.own_settings()
     # The one whose help is shown comes first, so that the defaults are its own.
     agents = sorted(AGENTS.items(), key=lambda named: named[0] != agent)
     groups = [(f"Model of {name}", model_settings(each.agent_class.made_of())) for name, each in agents]
-    groups += [(f"Policy of {name}", settings_of(each.agent_class.controller_class)) for name, each in agents]
+    groups += [(f"Policy of {name}", controller_settings(each.agent_class.made_of())) for name, each in agents]
     groups += [("Planner", {n: s for n, s in own.items() if n in _PLANNING})]
     groups += [("Planner", settings_of(planner_factory(name))) for name in PLANNERS]
     groups += [("Training", {n: s for n, s in own.items() if n not in _PLANNING})]

@@ -199,8 +199,7 @@ def _defaults(checkpoint: Checkpoint, planner: Any) -> dict[str, Any]:
         return {}
     is_known = isinstance(planner, str) and planner in PLANNERS
     settings = agent.saved_settings(planner if is_known else "cem")
-    changed = agent.part_defaults
-    defaults = {name: encode(changed.get(name, setting.default)) for name, setting in settings.items()}
+    defaults = {name: encode(setting.default) for name, setting in settings.items()}
     return {"planner": "cem", **defaults}
 
 

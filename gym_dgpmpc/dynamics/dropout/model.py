@@ -72,7 +72,7 @@ class DropoutDynamics(Learner[_Fitted]):
         dropout: chance that a hidden unit is left out of a function.
         prior_lengthscale: l of the prior N(0, 1 / l^2) on weights and biases, from which their decay follows: the
             longer, the smoother are the functions.
-        noise_std: standard deviation of the noise, in those of the targets; None learns it, one for each target.
+        model_noise_std: standard deviation of the noise, in those of the targets; None learns it, one for each target.
         learning_rate: learning rate of Adam.
         batch_size: transitions in a minibatch.
         num_epochs: passes over the data in each training; with ``patience`` the most of them.
@@ -98,7 +98,7 @@ class DropoutDynamics(Learner[_Fitted]):
         hidden_size: int = 200,
         dropout: float = 0.05,
         prior_lengthscale: float = 1.0,
-        noise_std: float | None = None,
+        model_noise_std: float | None = None,
         learning_rate: float = 1e-3,
         batch_size: int = 100,
         num_epochs: int = 1000,
@@ -111,13 +111,13 @@ class DropoutDynamics(Learner[_Fitted]):
         check_counts(num_hidden_layers=num_hidden_layers, hidden_size=hidden_size)
         check_reals("[0, 1)", dropout=dropout)
         check_reals("[0, inf)", prior_lengthscale=prior_lengthscale)
-        if noise_std is not None:
-            check_reals("(0, inf)", noise_std=noise_std)
+        if model_noise_std is not None:
+            check_reals("(0, inf)", model_noise_std=model_noise_std)
         self.epochs = Epochs(learning_rate, batch_size, num_epochs, patience)
         self.epochs.check()
         noise = {"add_noise": add_noise, "split_noise": split_noise}
         super().__init__(observation_size, action_size, observation_spec, dtype, device, **noise)
-        self.dropout, self.prior_lengthscale, self.noise_std = dropout, prior_lengthscale, noise_std
+        self.dropout, self.prior_lengthscale, self.model_noise_std = dropout, prior_lengthscale, model_noise_std
         self.sizes = layer_sizes(self.encoder.input_size, num_hidden_layers, hidden_size, self.encoder.target_size)
 
     def fit(self, data: Transitions, generator: torch.Generator) -> Mapping[str, float]:
@@ -128,7 +128,7 @@ class DropoutDynamics(Learner[_Fitted]):
         """
         normalisers, standardised = self._standardised(data)
         if self._fitted is None:
-            first = math.log(FIRST_NOISE) if self.noise_std is None else 2.0 * math.log(self.noise_std)
+            first = math.log(FIRST_NOISE) if self.model_noise_std is None else 2.0 * math.log(self.model_noise_std)
             start = Trained.untrained(initial_network(self.sizes, first, generator, self.device).parameters())
         else:
             start = self._fitted.trained
@@ -234,7 +234,7 @@ class DropoutDynamics(Learner[_Fitted]):
             network = DropoutNetwork.from_parameters(parameters)
             return float(misfit(network, mean_kept(network, self.dropout), x[held_out], y[held_out]))
 
-        noise_rate = self.epochs.learning_rate * NOISE_LEARNS_FASTER if self.noise_std is None else 0.0
+        noise_rate = self.epochs.learning_rate * NOISE_LEARNS_FASTER if self.model_noise_std is None else 0.0
         return self.epochs.train(
             start,
             learned.unsqueeze(0),
