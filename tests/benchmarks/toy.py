@@ -32,6 +32,7 @@ TINY = {
     "GP-MPC": SPARSE_GP | {"horizon": 3, "num_iterations": 1, "num_starts": 1, "num_particles": 10},
     "MC-PILCO": DEEP_GP | SEARCH,
     "MC-PILCO DGP L=2": DEEP_GP | SEARCH,
+    "DeepPILCO": SEARCH | {"hidden_size": 8, "num_epochs": 2},
     "PILCO": SPARSE_GP | {"max_search_iterations": 1, "search_horizon": 2},
     "DGP L=2 and PETS": for_mixture(SMALLEST_AGENT, NETWORKS | {"num_epochs": 2}),
     "true dynamics": PLANNING,

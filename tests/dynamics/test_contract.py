@@ -521,8 +521,8 @@ def test_draws_of_a_gaussian_process_with_noise_spread_by_the_recursion(name):
     assert (spread[:, 2] == 0).all(), "a constant has no noise"
 
 
-@pytest.mark.parametrize("name", [name for name in GAUSSIAN_PROCESSES if "MM" not in name])
-def test_steps_of_a_gaussian_process_keep_within_what_was_seen(name):
+@pytest.mark.parametrize("name", [*(name for name in GAUSSIAN_PROCESSES if "MM" not in name), "dropout"])
+def test_steps_keep_within_what_was_seen(name):
     """And one and a half times its range on either side. (`MM` draws anew from the bounded particles' moments.)"""
     model = CASES[name].make(add_noise=True)
     narrow = {

@@ -31,14 +31,14 @@ def bent_actor():
     return torch.nn.Sequential(*layers).double()
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_the_slope_is_that_of_the_value(noise):
+@pytest.mark.parametrize(("noise", "matches_moments"), [(0.0, False), (0.1, False), (0.1, True)])
+def test_the_slope_is_that_of_the_value(noise, matches_moments):
     """Central differences in float64: their error is of the order of the step squared and of rounding over the step."""
     actor, env = bent_actor(), worlds(num_worlds=3)
 
     def value():
         env.generator.manual_seed(1)
-        return Paths(env, 4, 5, noise).mean_reward(actor)
+        return Paths(env, 4, 5, noise, matches_moments=matches_moments).mean_reward(actor)
 
     value().backward()
     for parameter in actor.parameters():
@@ -73,6 +73,64 @@ def test_what_is_lost_or_over_earns_as_in_the_worlds():
             earned += np.where(over, 0.0, rewards)
             over |= dones
         assert mean_reward == pytest.approx(earned.mean() / 8, rel=1e-6)
+
+
+class Watched(Shift):
+    """Keeps what each step of a draw begins from and what it gives."""
+
+    def draw(self, num_particles, horizon, generator):
+        sampler, self.before, self.after = super().draw(num_particles, horizon, generator), [], []
+
+        def watching(observation, action, step):
+            self.before.append(observation)
+            self.after.append(sampler(observation, action, step))
+            return self.after[-1]
+
+        return watching
+
+
+def idle():
+    """An actor that does nothing."""
+    actor = torch.nn.Linear(2, 1).double()
+    torch.nn.init.zeros_(actor.weight)
+    torch.nn.init.zeros_(actor.bias)
+    return actor
+
+
+def test_particles_are_drawn_anew_from_their_moments():
+    """Within five standard errors, of a mean sqrt(V / n), of a variance sqrt(2 / n) V, of a correlation sqrt(1 / n):
+    there is none between a particle and that in whose place it comes."""
+    env, count = worlds(num_worlds=1000), 1000 * 4
+    env.dynamics = Watched()
+    Paths(env, 4, 4, 0.0, matches_moments=True).mean_reward(idle())
+    for after, before in zip(env.dynamics.after[:-1], env.dynamics.before[1:], strict=True):
+        old, new = after.detach().flatten(0, 1), before.detach().flatten(0, 1)
+        variance = old.var(0, correction=0)
+        assert ((new.mean(0) - old.mean(0)).abs() <= 5 * (variance / count).sqrt()).all()
+        assert ((new.var(0) - variance).abs() <= 5 * variance * (2 / count) ** 0.5).all()
+        assert abs(np.corrcoef(old[:, 0], new[:, 0])[0, 1]) <= 5 * count**-0.5
+
+
+def test_only_particles_that_go_on_have_a_part_in_the_moments():
+    """Two of three worlds move alike, to 1, 2, ...; the third is lost at the first step, and stays where it was."""
+
+    class Lost(Watched):
+        def draw(self, num_particles, horizon, generator):
+            own = torch.tensor([1.0, 1.0, torch.nan], dtype=torch.float64).view(3, 1, 1)
+            self.before = []
+
+            def sampler(observation, action, step):
+                self.before.append(observation.detach())
+                return observation + action + own
+
+            return sampler
+
+    env = worlds(num_worlds=3, least_reward=-7.0)
+    env.dynamics = Lost()
+    mean_reward = Paths(env, 4, 1, 0.0, matches_moments=True).mean_reward(idle()).item()
+    for step, before in enumerate(env.dynamics.before):
+        assert before[:, 0, 0].tolist() == [step, step, 0.0]
+    assert mean_reward == pytest.approx(-(2 * (1 + 4 + 9 + 16) + 4 * 7) / 3 / 4, rel=1e-12)
 
 
 def test_it_finds_the_optimum_of_a_linear_quadratic_problem(learned, monkeypatch):

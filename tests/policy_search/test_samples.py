@@ -1,9 +1,12 @@
 """The search by samples: its gradient against differences with the draws held, what is dropped, and that it climbs."""
 
+from functools import partial
+
 import pytest
 import torch
 
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
+from gym_dgpmpc.dynamics.dropout import DropoutDynamics
 from gym_dgpmpc.imagination.gradient import Paths
 from gym_dgpmpc.imagination.worlds import ImaginedVecEnv
 from gym_dgpmpc.policy_search.policies import LinearPolicy, RBFPolicy
@@ -19,31 +22,42 @@ def policy(num_centres=4, size=2):
     return RBFPolicy(fed(size=size), 1, "tanh", num_centres, seeded(1)).double()
 
 
-def of_functions(num_layers):
-    """Worlds of functions drawn from a Gaussian process, or from a deep one, in double precision."""
-    generator = seeded(2)
-    state, action = normal(generator, 30, 2), 2 * normal(generator, 30, 1)
-    after = state + 0.3 * torch.cat([state[:, 1:], action], 1)
-    model = DeepGPDynamics(
+def a_deep_gp(num_layers):
+    return DeepGPDynamics(
         2, 1, num_layers=num_layers, kernel="rbf", num_inducing=8, num_features=16, first_training_iterations=5,
         num_samples=5, sample_spacing=1, dtype=torch.float64,
     )  # fmt: skip
+
+
+def of_functions(model):
+    """Worlds of functions drawn from a model, in double precision."""
+    generator = seeded(2)
+    state, action = normal(generator, 30, 2), 2 * normal(generator, 30, 1)
+    after = state + 0.3 * torch.cat([state[:, 1:], action], 1)
     model.fit(Transitions(state.float(), action.float(), after.float()), generator)
     return ImaginedVecEnv(
         model, reward_fn, beginnings, OBSERVATIONS, ACTIONS, num_worlds=3, episode_steps=4, seed=0, dtype=torch.float64
     )
 
 
-@pytest.mark.parametrize("num_layers", [1, 2])
-def test_the_slope_is_that_of_the_value(num_layers):
+MODELS = {
+    "gp": partial(a_deep_gp, 1),
+    "deep gp": partial(a_deep_gp, 2),
+    "dropout": partial(DropoutDynamics, 2, 1, hidden_size=8, num_epochs=5, dropout=0.3, dtype=torch.float64),
+}
+
+
+@pytest.mark.parametrize("matches_moments", [False, True])
+@pytest.mark.parametrize("model", MODELS)
+def test_the_slope_is_that_of_the_value(model, matches_moments):
     """Central differences in float64: their error is of the order of the step squared and of rounding over the step."""
-    env, searched = of_functions(num_layers), policy()
+    env, searched = of_functions(MODELS[model]()), policy()
 
     def value():
         env.generator.manual_seed(1)
         acting = Dropped(searched, env.generator)
         acting.rate = 0.3
-        return Paths(env, 4, 2, 0.0, goes_on=0.0).mean_reward(acting)
+        return Paths(env, 4, 2, 0.0, goes_on=0.0, matches_moments=matches_moments).mean_reward(acting)
 
     value().backward()
     for parameter in searched.parameters():
