@@ -38,7 +38,7 @@ def not_differentiable(sampler: object) -> NotDifferentiableError:
     return NotDifferentiableError(
         f"{type(sampler).__name__} has no gradients: its next states do not follow from state and action by "
         "differentiable operations of PyTorch. Plan by a planner that asks for none (cem, icem or mppi), or with draws "
-        "that have them (of a deep Gaussian process, an ensemble of networks or a sparse one; not AMM with split_noise)"
+        "that have them (of a deep or a sparse Gaussian process, or of networks; not AMM with split_noise)"
     )
 
 

@@ -59,9 +59,9 @@ class DropoutDynamics(Learner[_Fitted]):
     """Implements `DynamicsModel` with one network with dropout, whose functions are drawn by drawing masks.
 
     Inputs and targets are standardised at each training; the network and Adam go on from where the last training left
-    them. Within an episode nothing is learned. Layers, dropout, sigmoids and minibatches are as public
-    reimplementations of DeepPILCO have them; the noise that is learned, the prior's lengthscale and the training's
-    length are this package's.
+    them. Within an episode nothing is learned. Layers, sigmoids, dropout and minibatches are as a public
+    reimplementation of DeepPILCO has them; the noise that is learned, the prior's lengthscale, and how fast and how
+    long it is trained, are this package's.
 
     Args:
         observation_size: numbers in an observation, S.
