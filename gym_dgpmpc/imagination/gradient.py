@@ -167,7 +167,7 @@ class Paths:
             # What is lost has no gradient; in its place a state that keeps what comes after it finite.
             after = torch.where((lost | ~alive).unsqueeze(-1), states.detach(), after)
             earns = alive & ~lost
-            if self._matches_moments:
+            if self._matches_moments and earns.any():
                 after = after.masked_scatter(
                     earns.unsqueeze(-1), match_moments(after[earns].unsqueeze(1), env.generator)
                 )

@@ -111,12 +111,15 @@ def test_particles_are_drawn_anew_from_their_moments():
         assert abs(np.corrcoef(old[:, 0], new[:, 0])[0, 1]) <= 5 * count**-0.5
 
 
-def test_only_particles_that_go_on_have_a_part_in_the_moments():
-    """Two of three worlds move alike, to 1, 2, ...; the third is lost at the first step, and stays where it was."""
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("num_lost", [1, 3])
+def test_only_particles_that_go_on_have_a_part_in_the_moments(num_lost):
+    """They all move alike, to 1, 2, ...; those lost at the first step stay where they were. None may be left."""
 
     class Lost(Watched):
         def draw(self, num_particles, horizon, generator):
-            own = torch.tensor([1.0, 1.0, torch.nan], dtype=torch.float64).view(3, 1, 1)
+            own = torch.ones(3, 1, 1, dtype=torch.float64)
+            own[3 - num_lost :] = torch.nan
             self.before = []
 
             def sampler(observation, action, step):
@@ -129,8 +132,9 @@ def test_only_particles_that_go_on_have_a_part_in_the_moments():
     env.dynamics = Lost()
     mean_reward = Paths(env, 4, 1, 0.0, matches_moments=True).mean_reward(idle()).item()
     for step, before in enumerate(env.dynamics.before):
-        assert before[:, 0, 0].tolist() == [step, step, 0.0]
-    assert mean_reward == pytest.approx(-(2 * (1 + 4 + 9 + 16) + 4 * 7) / 3 / 4, rel=1e-12)
+        assert before[:, 0, 0].tolist() == [step] * (3 - num_lost) + [0.0] * num_lost
+    earned = -(3 - num_lost) * (1 + 4 + 9 + 16) - 7 * 4 * num_lost
+    assert mean_reward == pytest.approx(earned / 3 / 4, rel=1e-12)
 
 
 def test_it_finds_the_optimum_of_a_linear_quadratic_problem(learned, monkeypatch):
