@@ -84,6 +84,9 @@ class DropoutDynamics(Learner[_Fitted]):
         dtype: precision of rollouts; the network is trained in float32.
         device: where tensors live.
 
+    Attributes:
+        epochs: how the network is trained.
+
     Raises:
         TypeError, ValueError: a setting is out of its range.
     """

@@ -78,6 +78,7 @@ class EnsembleDynamics(Learner[_Fitted]):
 
     Attributes:
         draw_kind: the setting ``draw``; `draw` is the method.
+        epochs: how the networks are trained.
 
     Raises:
         ValueError: a setting is out of its range.

@@ -150,7 +150,7 @@ def test_members_are_made_with_their_own_settings():
     assert (deep.num_layers, sparse.kernel.name, networks.draw_kind) == (3, "matern32", "DS")
     assert {each.dtype for each in model.models.values()} == {torch.float64}
     # Weights are of predictions with noise, and of networks that are trained as far as they can be.
-    assert sparse.add_noise and (networks.num_epochs, networks.patience) == (300, 15)
+    assert sparse.add_noise and (networks.epochs.num_epochs, networks.epochs.patience) == (300, 15)
 
 
 @pytest.mark.parametrize(
