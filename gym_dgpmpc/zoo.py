@@ -22,6 +22,7 @@ from gym_dgpmpc.cli.options import AGENTS, Trained, value_given
 from gym_dgpmpc.cli.request import DEFAULT_EPISODES
 from gym_dgpmpc.envs.registration import ENVIRONMENTS
 from gym_dgpmpc.extras import how_to_install
+from gym_dgpmpc.policy_search.controller import MomentSearchController, PolicySearchController
 
 COMMANDS = {
     **{name: f"rl_zoo3.{name}" for name in ("train", "enjoy", "record_video", "push_to_hub", "load_from_hub")},
@@ -73,14 +74,8 @@ SEARCHED: Mapping[str, Callable[[Trial, str], Any]] = MappingProxyType(
 )
 """Settings that ``-optimize`` searches where an agent has them: which matter most, and what a trial takes of each."""
 
-NOT_SEARCHED: Mapping[str, frozenset[str]] = MappingProxyType(
-    {
-        "mc-pilco": frozenset({"horizon", "num_iterations", "num_particles"}),  # of the planner, which acts nowhere
-        "pilco": frozenset({"horizon", "num_iterations", "num_particles", "kernel"}),
-    }
-)
-"""Of an agent, settings of `SEARCHED` that it has and that change nothing, or that cannot be others: PILCO's moments
-are those of RBF kernels."""
+OF_THE_PLANNER = frozenset({"horizon", "num_iterations", "num_particles"})
+"""Settings that do nothing where a policy acts that is searched."""
 
 
 def hyperparameters(algorithm: str) -> dict[str, dict[str, Any]]:
@@ -105,9 +100,12 @@ def _run(env_id: str | None = None) -> dict[str, Any]:
 def sample(algorithm: str, trial: Trial, *_: Any) -> dict[str, Any]:
     """Hyperparameters of a trial, as the zoo asks for them; further arguments are of no use here."""
     agent_class = ALGORITHMS[algorithm].agent_class
-    own = {**agent_class.own_settings(), **agent_class.part_settings()}
-    names = [name for name in SEARCHED if name in own and name not in NOT_SEARCHED.get(algorithm, ())]
-    return {name: SEARCHED[name](trial, name) for name in names}
+    names = {**agent_class.own_settings(), **agent_class.part_settings()}.keys() & SEARCHED.keys()
+    if issubclass(agent_class.controller_class, PolicySearchController):
+        names -= OF_THE_PLANNER
+    if agent_class.controller_class is MomentSearchController:
+        names -= {"kernel"}  # whose moments are those of RBF kernels
+    return {name: suggest(trial, name) for name, suggest in SEARCHED.items() if name in names}
 
 
 def _conf(algorithm: str) -> str:
