@@ -28,6 +28,7 @@ from benchmarks.report import markdown
 from benchmarks.rows import Row, made_by, measure_missing
 from gym_dgpmpc import DeepPILCOAgent, DGPMPCAgent, MCPILCOAgent, PILCOAgent
 from gym_dgpmpc.agents import MPCAgent
+from gym_dgpmpc.agents.presets import settings_for
 from gym_dgpmpc.runs.provenance import revision
 from gym_dgpmpc.types import ObservationSpec
 
@@ -115,6 +116,7 @@ gymnasium.register("OutsideCartPole-v0", "benchmarks.outside:OutsideCartPole", m
 METHODS: Mapping[str, Callable[..., MPCAgent]] = MappingProxyType(
     {
         "DGP-MPC": DGPMPCAgent,
+        "DGP-MPC, settings_for()": partial(DGPMPCAgent, **settings_for()),
         "MC-PILCO": MCPILCOAgent,
         "MC-PILCO, deep GP": partial(MCPILCOAgent, num_layers=2, kernel="matern32"),
         "DeepPILCO": DeepPILCOAgent,

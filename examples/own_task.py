@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from gym_dgpmpc import DGPMPCAgent
+from gym_dgpmpc import DGPMPCAgent, settings_for
 
 
 class TwoTanks(gym.Env):
@@ -31,7 +31,7 @@ class TwoTanks(gym.Env):
 
 def main(episodes=4, **settings):
     env = gym.wrappers.TimeLimit(TwoTanks(), max_episode_steps=60)
-    agent = DGPMPCAgent(env, seed=0, verbose=1, **settings)
+    agent = DGPMPCAgent(env, **{**settings_for(), "seed": 0, "verbose": 1, **settings})
     return agent.learn(60 * episodes)
 
 

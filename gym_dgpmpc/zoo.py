@@ -81,17 +81,18 @@ OF_THE_PLANNER = frozenset({"horizon", "num_iterations", "num_particles"})
 def hyperparameters(algorithm: str) -> dict[str, dict[str, Any]]:
     """By task, what the zoo reads: an agent's presets, the policy's name, and how many steps to learn.
 
+    "default" is the zoo's name for every other task.
+
     Args:
         algorithm: a name of `ALGORITHMS`.
     """
-    tasks = (*ENVIRONMENTS, *presets.STOCK)
-    of_tasks = {env_id: {**ALGORITHMS[algorithm].settings_for(env_id), **_run(env_id)} for env_id in tasks}
-    return of_tasks | {"default": _run()}
+    tasks = (*ENVIRONMENTS, *presets.STOCK, "default")
+    return {task: {**ALGORITHMS[algorithm].settings_for(task), **_run(task)} for task in tasks}
 
 
-def _run(env_id: str | None = None) -> dict[str, Any]:
+def _run(env_id: str) -> dict[str, Any]:
     """What does not depend on the agent. Episodes are as many as `dgpmpc train` plays, after a random one."""
-    spec = gymnasium.registry.get(env_id) if env_id else None
+    spec = gymnasium.registry.get(env_id)
     length = spec.max_episode_steps if spec else None
     steps = DEFAULT_TIMESTEPS if length is None else (1 + DEFAULT_EPISODES) * length
     return {"policy": "MPCPolicy", "n_timesteps": steps}

@@ -418,7 +418,7 @@ def test_planner_risk_and_exploration_are_options(run):
     assert {**arguments, **expected, "exploration_beta": 0.5} == arguments
     assert run("evaluate", "a", "--episodes", 1).exit_code == 0
     assert is_one_line_error(run(*command, *options), "exploration_beta was 0.5, now 1.0")
-    assert is_one_line_error(run(*command, "--noise-beta=2"), "plans by cem", "noise_beta")
+    assert is_one_line_error(run(*command, "--planner=cem", "--noise-beta=2"), "plans by cem", "noise_beta")
     shown = re.sub(r"[\s│]+", " ", run_wide("train", "--help"))
     for choices in (PlannerName, RiskName, ExplorationName):
         assert "|".join(get_args(choices)) in shown

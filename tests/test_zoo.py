@@ -33,7 +33,7 @@ def test_every_registered_task_has_the_presets_of_each_agent(algorithm):
     for env_id, settings in found.items():
         steps = settings.pop("n_timesteps")
         assert settings.pop("policy") == "MPCPolicy"
-        assert settings == ({} if env_id == "default" else dict(zoo.ALGORITHMS[algorithm].settings_for(env_id)))
+        assert settings == zoo.ALGORITHMS[algorithm].settings_for(env_id)
         if env_id in ENVIRONMENTS:  # a random episode and as many as `dgpmpc train` plays
             assert steps == 16 * ENVIRONMENTS[env_id][1]
 

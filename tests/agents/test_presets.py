@@ -39,14 +39,16 @@ def test_settings_are_found_by_id():
     assert half_cheetah == {**presets.PAPER["VelocityHalfCheetah-v0"], **own}
     with_module = "gym_dgpmpc.envs.robotics:FetchReachDense-v4"
     assert presets.settings_for(with_module) == presets.STOCK["FetchReachDense-v4"]
-    assert presets.settings_for("ToyPush-v0") == {}
+    assert presets.settings_for("ToyPush-v0") == presets.settings_for() == presets.OWN_TASK
     # What another planner has no use for is left out.
     reacher = presets.PAPER["BiasedReacher-v0"]
     of_sampling = {name: reacher[name] for name in ("num_candidates", "num_elites")}
     climbing = {name: value for name, value in reacher.items() if name not in of_sampling} | {"planner": "gradient"}
     assert presets.settings_for("BiasedReacher-v0") == climbing
     assert presets.settings_for("BiasedReacher-v0", "icem") == {**reacher, "planner": "icem"}
-    assert presets.settings_for("ToyPush-v0", "mppi") == {"planner": "mppi"}
+    assert presets.settings_for("ToyPush-v0", "mppi") == {**presets.OWN_TASK, "planner": "mppi"}
+    without_colour = {name: value for name, value in presets.OWN_TASK.items() if name != "noise_beta"}
+    assert presets.settings_for(planner="cem") == {**without_colour, "planner": "cem"}
     with pytest.raises(ValueError, match="unknown planner 'best'"):
         presets.settings_for("ToyPush-v0", "best")
     assert not set(presets.PAPER) & set(presets.STOCK)
