@@ -50,7 +50,7 @@ from gym_dgpmpc.checkpoints.format import CheckpointPath, write_checkpoint
 from gym_dgpmpc.checkpoints.interface import StateOf
 from gym_dgpmpc.checkpoints.restore import load_agent
 from gym_dgpmpc.checkpoints.safeguard import Guard, callbacks_before, safeguard
-from gym_dgpmpc.checks import check_counts
+from gym_dgpmpc.checks import check_counts, check_reals
 from gym_dgpmpc.data.transitions import TransitionStore
 from gym_dgpmpc.errors import EnvironmentDataError, EnvironmentFailedError
 from gym_dgpmpc.imagination import AlgorithmName, StartFunction, StartName, algorithm_class, budget_of, imagine
@@ -540,6 +540,7 @@ class MPCAgent(BaseAlgorithm):
             ValueError: the agent was loaded without an environment, or an argument is missing or out of its range.
             KeyboardInterrupt, SystemExit: Ctrl-C or SIGTERM, with ``run_folder``.
         """
+        check_reals("[0, inf]", total_timesteps=total_timesteps)
         if self.env is None:
             raise ValueError("the agent has no environment to learn in: pass env=... to load, or call set_env(env)")
         with (

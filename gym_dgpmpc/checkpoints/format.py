@@ -153,9 +153,11 @@ def read_checkpoint(path: CheckpointPath) -> Checkpoint:
     source = Path(path)
     if not source.exists() and source.with_name(f"{source.name}.zip").exists():
         source = source.with_name(f"{source.name}.zip")
+    if not source.exists():
+        raise FileNotFoundError(f"there is no file {source}: give the path that `save` was given, or a run's agent.zip")
     if source.is_dir():
         raise CheckpointError(f"{source} is a folder, not a checkpoint file")
-    if source.exists() and not source.is_file():
+    if not source.is_file():
         raise CheckpointError(f"{source} is not a regular file")
     with open(source, "rb") as file:
         return _read(file, str(source))

@@ -30,6 +30,14 @@ def test_total_timesteps_counts_every_step(total):
     assert learner.num_timesteps == len(learner.store) == len(learner.env.get_attr("steps")[0]) == total
 
 
+@pytest.mark.parametrize(("total", "error"), [(-5, ValueError), (float("nan"), ValueError), ("20", TypeError)])
+def test_steps_that_cannot_be_taken_are_refused(total, error):
+    learner = agent()
+    with pytest.raises(error, match=f"total_timesteps.*{total}"):
+        learner.learn(total)
+    assert len(learner.store) == 0
+
+
 def test_the_store_holds_what_the_environment_did():
     """Also at an episode's end, where a VecEnv returns the next episode's first observation."""
     learner = agent()
