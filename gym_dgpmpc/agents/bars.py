@@ -1,7 +1,8 @@
 """Bars on the terminal while an agent learns: the steps of the call, and how far a training is that takes a while.
 
 In place of Stable-Baselines3's, which knows nothing of trainings, and after an error leaves the terminal without a
-cursor. A log file gets one line at the end, without control characters.
+cursor. A log file, and a terminal that can only print (`TERM=dumb`), get one line at the end, without control
+characters.
 """
 
 import threading
@@ -48,7 +49,7 @@ class Bars:
     def begin(self, num_steps: int) -> None:
         """Show the bar of so many environment steps, if there are any to take."""
         console = get_console()
-        if not self._wanted or (num_steps <= 0 and not console.is_terminal):
+        if not self._wanted or (num_steps <= 0 and not console.is_interactive):
             return
         self._progress = Progress(
             TextColumn("{task.description:8}"),

@@ -76,17 +76,19 @@ def test_who_wants_no_bar_sees_none(drawn, capsys):
     assert learner.logger.name_to_value["train/last_loss"] == 0.25
 
 
+@pytest.mark.parametrize("terminal", [False, True], ids=["log file", "dumb terminal"])
 @pytest.mark.parametrize("steps", [11, 0])
-def test_a_log_file_has_no_control_characters(steps, monkeypatch):
+def test_what_can_only_print_gets_no_control_characters(steps, terminal, monkeypatch):
     file = io.StringIO()
-    monkeypatch.setattr(bars, "get_console", lambda: Console(file=file, width=100))
+    console = Console(file=file, width=100, force_terminal=terminal, _environ={"TERM": "dumb", "NO_COLOR": "1"})
+    monkeypatch.setattr(bars, "get_console", lambda: console)
     monkeypatch.setattr(bars, "SHOWN_AFTER", SHOWN_AFTER)
     learner = agent(dynamics=Reporting())
     learner.learn(steps, progress_bar=True)
     text = file.getvalue()
     assert "\x1b" not in text
     assert "\r" not in text
-    assert len(text.splitlines()) == (1 if steps else 0)
+    assert len(text.strip().splitlines()) == 1 if steps else text == ""
 
 
 def test_an_error_gives_the_terminal_back(drawn):
