@@ -338,6 +338,12 @@ def test_help_does_not_wait_for_pytorch():
     assert subprocess.run([sys.executable, "-c", script]).returncode == 0
 
 
+def test_an_agent_does_not_wait_for_what_its_training_needs():
+    slow = ("scipy.cluster", "scipy.optimize")
+    script = f"import sys; from gym_dgpmpc import DGPMPCAgent; sys.exit(any(name in sys.modules for name in {slow}))"
+    assert subprocess.run([sys.executable, "-c", script]).returncode == 0
+
+
 def test_runs_as_a_module():
     result = subprocess.run([sys.executable, "-m", "gym_dgpmpc", "--version"], capture_output=True, text=True)
     assert result.stdout.startswith("dgpmpc ")

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.optimize import OptimizeResult, minimize
 
 from gym_dgpmpc.data.standardised import Data
 from gym_dgpmpc.gp.deep_gp import DeepGP
@@ -44,6 +43,8 @@ def maximise_bound(
         free_inducing_inputs: move the inducing inputs too, instead of the hyperparameters alone.
         on_progress: is told after every iteration how many there were, of how many at most, and the negative bound.
     """
+    from scipy.optimize import OptimizeResult, minimize  # here, for it takes long to import
+
     (layer,) = model.layers
     start = [layer.log_lengthscale, layer.log_variance.unsqueeze(0), model.log_noise]
     limits = [LENGTHSCALES, VARIANCES, NOISE_VARIANCES]

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.optimize import minimize
 from torch import Tensor
 
 from gym_dgpmpc.dynamics.sparse_gp.moment_matching import orthonormal_frame
@@ -118,6 +117,8 @@ def search(policy: SquashedPolicy, path: BeliefPath, max_iterations: int) -> dic
     Raises:
         NotDifferentiableError: no gradient comes through the reward.
     """
+    from scipy.optimize import minimize  # here, for it takes long to import
+
     parameters = list(policy.parameters())
     start = torch.nn.utils.parameters_to_vector(parameters).detach().cpu().numpy().copy()
     best, worst = (math.inf, start), 0.0  # of the negative returns

@@ -9,7 +9,6 @@ import warnings
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
 from gym_dgpmpc.data.normaliser import Normaliser
@@ -59,6 +58,8 @@ def cluster(x: Float[Tensor, "N D"], num_clusters: int, generator: torch.Generat
         extra = torch.randint(num_rows, (num_clusters - num_rows,), generator=generator, device=x.device)
         spread = 0.1 * torch.randn(len(extra), x.shape[1], generator=generator, dtype=x.dtype, device=x.device)
         return torch.cat([x, x[extra] + spread])
+    from scipy.cluster.vq import kmeans2  # here, for it takes long to import
+
     seed = int(torch.randint(2**31, (), generator=generator, device=x.device))
     with warnings.catch_warnings():
         # An empty cluster keeps its last centre, which is as good an inducing input as any.
