@@ -1,15 +1,17 @@
 """Bars on the terminal while an agent learns: the steps of the call, and how far a training is that takes a while.
 
 In place of Stable-Baselines3's, which knows nothing of trainings, and after an error leaves the terminal without a
-cursor. A log file, and a terminal that can only print (`TERM=dumb`), get one line at the end, without control
-characters.
+cursor. What can only print, a log file, a terminal of `TERM=dumb` or a notebook without ipywidgets, gets one line at the
+end, without control characters.
 """
 
+import importlib.util
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rich import get_console
+from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -48,7 +50,7 @@ class Bars:
 
     def begin(self, num_steps: int) -> None:
         """Show the bar of so many environment steps, if there are any to take."""
-        console = get_console()
+        console = _console()
         if not self._wanted or (num_steps <= 0 and not console.is_interactive):
             return
         self._progress = Progress(
@@ -114,6 +116,14 @@ class Bars:
             timer.cancel()
             timer.join()  # lest it moves a bar that is gone
             progress.remove_task(task)
+
+
+def _console() -> Console:
+    """Rich's own, but in a notebook without ipywidgets, where that would draw no bar and warn at each attempt."""
+    console = get_console()
+    if console.is_jupyter and importlib.util.find_spec("ipywidgets") is None:
+        return Console(force_jupyter=False)
+    return console
 
 
 def _show_nothing(done: int, total: int, loss: float) -> None:

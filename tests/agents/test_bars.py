@@ -91,6 +91,15 @@ def test_what_can_only_print_gets_no_control_characters(steps, terminal, monkeyp
     assert len(text.strip().splitlines()) == 1 if steps else text == ""
 
 
+def test_a_notebook_without_widgets_is_like_a_log_file(monkeypatch, recwarn, capsys):
+    monkeypatch.setattr(bars, "get_console", lambda: Console(force_jupyter=True))
+    monkeypatch.setattr(bars.importlib.util, "find_spec", lambda name: None)
+    agent().learn(11, progress_bar=True)
+    (line,) = capsys.readouterr().out.splitlines()
+    assert "11/11" in line
+    assert not [warning for warning in recwarn if "ipywidgets" in str(warning.message)]
+
+
 def test_an_error_gives_the_terminal_back(drawn):
     """Its cursor is hidden while a bar is drawn."""
     learner = agent(KnownPointMass(fail_at=4, failure=RuntimeError("broken")))
