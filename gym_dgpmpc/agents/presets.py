@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
+from gymnasium.envs.registration import find_highest_version
+
 from gym_dgpmpc.dynamics.deep_gp import DeepGPDynamics
 from gym_dgpmpc.planning.registry import settings_of_others
 from gym_dgpmpc.settings import of_member, settings_of
@@ -107,18 +109,26 @@ OWN_TASK = MappingProxyType({"planner": "icem", "noise_beta": 1.0, "horizon": 20
 presets it earns more than the paper's way, which is what agents do by default (docs/planning.md)."""
 
 
+def _with_version(env_id: str) -> str:
+    """The id that presets are under: without a module, and with the newest version where none is given."""
+    task = env_id.rpartition(":")[2]
+    newest = find_highest_version(None, task)
+    return task if newest is None else f"{task}-v{newest}"
+
+
 def settings_for(env_id: str | None = None, planner: str | None = None) -> Mapping[str, Any]:
     """Settings of `DGPMPCAgent` for a task: its presets, or `OWN_TASK` if it has none.
 
     Args:
         env_id: id of the environment, with or without a module before it that registers it
-            ("gym_dgpmpc.envs.robotics:FetchReachDense-v4"); None: a task of one's own.
+            ("gym_dgpmpc.envs.robotics:FetchReachDense-v4"); without a version it is the newest registered one, as in
+            `gymnasium.make`. None: a task of one's own.
         planner: name of a planner in the place of the task's; settings that it does not have are left out.
 
     Raises:
         ValueError: no planner is registered under this name.
     """
-    task = "" if env_id is None else env_id.rpartition(":")[2]
+    task = "" if env_id is None else _with_version(env_id)
     settings = {name: value for table in OF_A_TASK for name, value in table.get(task, {}).items()} or dict(OWN_TASK)
     if planner is not None:
         settings["planner"] = planner
@@ -203,7 +213,7 @@ def mixture_settings_for(env_id: str) -> Mapping[str, Any]:
     """
     # Networks have fresh noise at each call, with which L-BFGS does not climb.
     climbs = settings_for(env_id).get("planner") == "gradient"
-    return for_mixture(settings_for(env_id, "cem" if climbs else None), NETWORKS.get(env_id.rpartition(":")[2], {}))
+    return for_mixture(settings_for(env_id, "cem" if climbs else None), NETWORKS.get(_with_version(env_id), {}))
 
 
 POLICY_SEARCH = MappingProxyType(
@@ -222,4 +232,4 @@ def policy_search_settings_for(env_id: str) -> Mapping[str, Any]:
     Args:
         env_id: as in `settings_for`.
     """
-    return POLICY_SEARCH.get(env_id.rpartition(":")[2], {})
+    return POLICY_SEARCH.get(_with_version(env_id), {})

@@ -54,6 +54,13 @@ def test_settings_are_found_by_id():
     assert not set(presets.PAPER) & set(presets.STOCK)
 
 
+@pytest.mark.parametrize("of", [presets.settings_for, presets.mixture_settings_for, presets.policy_search_settings_for])
+def test_an_id_without_a_version_has_the_settings_of_the_newest(of):
+    """As `gymnasium.make` has the environment, so that a run does not go without them unnoticed."""
+    assert of("ModCartPole") == of("gym_dgpmpc:ModCartPole") == of("ModCartPole-v0") != {}
+    assert of("ModCartPol") == of("ModCartPole-v9")
+
+
 def test_a_mixture_has_the_presets_of_its_members():
     """Each under its member's name; what is the planner's is the planner's."""
     own = presets.NETWORKS["VelocityHalfCheetah-v0"]
