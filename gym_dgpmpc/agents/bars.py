@@ -1,7 +1,7 @@
 """Bars on the terminal while an agent learns: the steps of the call, and how far a training is that takes a while.
 
 In place of Stable-Baselines3's, which knows nothing of trainings, and after an error leaves the terminal without a
-cursor. What can only print, a log file, a terminal of `TERM=dumb` or a notebook without ipywidgets, gets one line at the
+cursor. What can only print (a log file, a terminal of `TERM=dumb`, a notebook without ipywidgets) gets one line at the
 end, without control characters.
 """
 

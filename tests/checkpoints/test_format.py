@@ -72,7 +72,7 @@ def test_a_file_that_would_be_too_large_is_not_written(saved, tmp_path, monkeypa
 
 
 def test_a_missing_file_is_a_missing_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nothing.* agent.zip"):
+    with pytest.raises(FileNotFoundError, match=r"nothing.* agent\.zip"):
         load(tmp_path / "nothing")
     with pytest.raises(CheckpointError, match="is a folder"):
         load(tmp_path)
