@@ -122,7 +122,7 @@ def _console() -> Console:
     """Rich's own, but in a notebook without ipywidgets, where that would draw no bar and warn at each attempt."""
     console = get_console()
     if console.is_jupyter and importlib.util.find_spec("ipywidgets") is None:
-        return Console(force_jupyter=False)
+        return Console(force_jupyter=False, force_terminal=False)  # a kernel sets FORCE_COLOR
     return console
 
 

@@ -92,6 +92,7 @@ def test_what_can_only_print_gets_no_control_characters(steps, terminal, monkeyp
 
 
 def test_a_notebook_without_widgets_is_like_a_log_file(monkeypatch, recwarn, capsys):
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as kernels do
     monkeypatch.setattr(bars, "get_console", lambda: Console(force_jupyter=True))
     monkeypatch.setattr(bars.importlib.util, "find_spec", lambda name: None)
     agent().learn(11, progress_bar=True)
