@@ -105,7 +105,7 @@ class LookInside(BaseCallback):
         num_particles: worlds of each.
         share: the most processor time to spend on looking, of that of the whole run, in (0, 1]: pictures beyond it are
             left out until it suffices again, the longest missing comes first then; 1 draws them all. Numbers always
-            come.
+            come, and so does each picture once, when learning ends at the latest.
         video: log each episode as a moving picture with step, return and action in it, too; the environment must render
             ``rgb_array``. It does not count towards ``share``.
 
@@ -134,6 +134,7 @@ class LookInside(BaseCallback):
         self._started = time.process_time()
         self._costs, self._newest = dict[str, float](), dict[str, int]()  # of pictures by name: seconds, timestep
         self._drawable: dict[str, Callable[[], Picture]] = {}
+        self._left_out: dict[str, Callable[[], Picture]] = {}  # the newest of those that were never drawn
         self._heard: ReportsProgress | None = None  # whose training is listened to
         self._ear: _Losses | None = None  # by what
         self._watched: _Watched | None = None
@@ -185,6 +186,8 @@ class LookInside(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._stop_listening()
+        for name in tuple(self._left_out):
+            self._draw_one(name, self._left_out[name])
 
     def _listen(self) -> None:
         """Hear of the model's losses; asked again and again, since an agent may begin with a model anew."""
@@ -246,13 +249,18 @@ class LookInside(BaseCallback):
         drawable, self._drawable = self._drawable, {}
         for name in sorted(drawable, key=lambda name: self._newest.get(name, -1)) if self._tensorboard else ():
             left = self.share * (time.process_time() - self._started) - self.seconds
-            if self.share < 1 and self._costs.get(name, FIRST_GUESS) > left:
-                continue
-            before = self.seconds
-            with self._counted():
-                self.pictures[name] = drawable[name]()
-                self._write_pictures({name: Figure(self.pictures[name], close=False)})
-            self._costs[name], self._newest[name] = self.seconds - before, self.num_timesteps
+            if self.share == 1 or self._costs.get(name, FIRST_GUESS) <= left:
+                self._draw_one(name, drawable[name])
+            elif name not in self._newest:
+                self._left_out[name] = drawable[name]
+
+    def _draw_one(self, name: str, draw: Callable[[], Picture]) -> None:
+        before = self.seconds
+        with self._counted():
+            self.pictures[name] = draw()
+            self._write_pictures({name: Figure(self.pictures[name], close=False)})
+        self._costs[name], self._newest[name] = self.seconds - before, self.num_timesteps
+        self._left_out.pop(name, None)
 
     def _numbers(self, watched: _Watched, episode: PlayedEpisode, compared: Compared | None) -> dict[str, float]:
         """What can be said of an episode in numbers."""

@@ -230,9 +230,14 @@ def test_refuses_other_algorithms_and_environments_that_do_not_render():
         make(gymnasium.make("ToyPush-v0")).learn(1, LookInside(video=True))
 
 
-def test_without_time_there_are_no_pictures(tmp_path):
+def test_without_time_each_picture_comes_once_at_the_end(tmp_path):
     callback = LookInside(num_particles=10, share=1e-6)
-    learn(make(), tmp_path, "tensorboard", callback=callback, num_episodes=2)
-    assert callback.pictures == {}
-    events = EventAccumulator(str(tmp_path)).Reload().Tags()
-    assert events["images"] == [] and "look/coverage_90" in events["scalars"]
+    agent = learn(make(), tmp_path, "tensorboard", callback=callback, num_episodes=3)
+    assert set(callback.pictures) == {"fan", "scores", "planning", "training"}
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert {event.step for name in callback.pictures for event in events.Images(f"look/{name}")} == {
+        agent.num_timesteps
+    }
+    assert len(events.Images("look/fan")) == 1 and len(events.Scalars("look/coverage_90")) == 2
+    agent.learn(agent.num_timesteps // 3, reset_num_timesteps=False, callback=callback)
+    assert len(EventAccumulator(str(tmp_path)).Reload().Images("look/fan")) == 1
