@@ -111,7 +111,9 @@ class OutsideCartPole(gymnasium.Env[ndarray, ndarray]):
         return (self.path[-1] + self.noise * self.np_random.standard_normal(4)).astype(np.float32)
 
 
-gymnasium.register("OutsideCartPole-v0", "benchmarks.outside:OutsideCartPole", max_episode_steps=STEPS)
+ENV_ID = "OutsideCartPole-v0"
+if ENV_ID not in gymnasium.registry:  # as it is when this module runs, and is imported by `gymnasium.make` then
+    gymnasium.register(ENV_ID, "benchmarks.outside:OutsideCartPole", max_episode_steps=STEPS)
 
 CHOSEN: Mapping[str, Any] = {**settings_for(), "horizon": 15, "noise_beta": 0.5, "num_iterations": 8, "kernel": "rbf"}
 """Settings of DGP-MPC that were chosen for this task, on seeds 100 to 104."""
@@ -154,7 +156,7 @@ class Trials(gymnasium.Wrapper[ndarray, ndarray, ndarray, ndarray]):
 def measure(wanted: Row) -> Row:
     """One agent's trials."""
     started = time.process_time()
-    env = Trials(gymnasium.make("OutsideCartPole-v0"))
+    env = Trials(gymnasium.make(ENV_ID))
     agent = METHODS[wanted["method"]](env, learning_starts=STEPS, seed=wanted["seed"])
     agent.learn((1 + TRIALS) * STEPS)
     return {
