@@ -84,7 +84,7 @@ def test_a_start_beyond_the_limits_is_moved_to_them(monkeypatch, variance, kept)
         assert ((low <= start) & (start <= high)).all()
         return OptimizeResult(x=start, fun=function(start)[0], nfev=1)
 
-    monkeypatch.setattr("gym_dgpmpc.inference.lbfgs.minimize", stay)
+    monkeypatch.setattr("scipy.optimize.minimize", stay)
     data, generator = problem(num_data=30)
     start = start_from(data, 10, generator)
     layer = start.layers[0]._replace(
