@@ -100,7 +100,7 @@ def test_an_unknown_setting_is_refused_before_anything_is_measured(run, capsys):
 
 
 def test_returns_are_those_of_the_planned_episodes(monkeypatch):
-    monkeypatch.setattr(presets, "settings_for", lambda env_id: {**SMALLEST_AGENT, "learning_starts": 30})
+    monkeypatch.setattr(presets, "settings_for", lambda env_id=None: {**SMALLEST_AGENT, "learning_starts": 30})
     (wanted,) = defaults.wanted_rows({}, [100], ["OutsideCartPole-v0"], episodes=2)
     agents = []
 
