@@ -66,7 +66,9 @@ docs-links: $(INSTALLED)
 	$(SPHINX) -b linkcheck . build/links
 
 # MuJoCo draws off-screen through EGL or OSMesa, whichever works here; with neither, the tests of rendering skip.
-test: lint docs
+# Lint and docs beside each other, for each is of one thread.
+test: $(INSTALLED)
+	@$(MAKE) --no-print-directory -j2 lint docs
 	@gl=$${MUJOCO_GL:-$$($(BIN)/python -m gym_dgpmpc.runs.rendering)}; \
 	echo "MUJOCO_GL=$$gl"; \
 	MUJOCO_GL=$$gl $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
