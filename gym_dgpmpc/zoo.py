@@ -153,11 +153,10 @@ def _enjoy_with_environments() -> None:
 
 
 def with_presets(command: str, arguments: Sequence[str]) -> list[str]:
-    """The arguments of a command, with the presets of an agent of ours unless they name a file of hyperparameters."""
+    """The arguments of a command, before them the presets of an agent of ours: a file that is named later wins."""
     algorithm = value_given("--algo", arguments) or ""
-    is_given = any(each.partition("=")[0] in ("-conf", "--conf-file") for each in arguments)
-    is_ours = command == "train" and algorithm in ALGORITHMS and not is_given
-    return [*arguments, "--conf-file", _conf(algorithm)] if is_ours else list(arguments)
+    is_ours = command == "train" and algorithm in ALGORITHMS
+    return ["--conf-file", _conf(algorithm), *arguments] if is_ours else list(arguments)
 
 
 def main() -> None:

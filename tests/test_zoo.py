@@ -1,9 +1,10 @@
 """What `python -m gym_dgpmpc.zoo` hands to the RL Zoo, whose commands run in `python -m tests.faults.packages`."""
 
-import inspect
+import argparse
 import sys
 
 import pytest
+from stable_baselines3.common.utils import ConstantSchedule
 
 from gym_dgpmpc import zoo
 from gym_dgpmpc.agents import presets
@@ -51,8 +52,7 @@ def test_an_agent_takes_what_a_trial_samples(algorithm, takes_last):
     sampled = zoo.sample(algorithm, trial, 1, 1, {})
     assert list(sampled) == trial.asked and set(sampled) <= set(zoo.SEARCHED) and sampled
     agent = zoo.ALGORITHMS[algorithm].agent_class(PointMass(), **sampled, seed=0)
-    names = {*agent.settings, *inspect.signature(type(agent)).parameters}
-    assert set(sampled) <= names
+    assert sampled.items() <= agent.arguments().items()
 
 
 def test_the_agents_of_the_deep_gaussian_process_search_its_depth_and_the_horizon():
@@ -61,21 +61,33 @@ def test_the_agents_of_the_deep_gaussian_process_search_its_depth_and_the_horizo
 
 
 @pytest.mark.parametrize(
-    ("command", "arguments", "added"),
+    ("command", "arguments", "read"),
     [
-        ("train", ["--algo", "dgp-mpc", "--env", "ModCartPole-v0"], True),
-        ("train", ["--env", "ModCartPole-v0", "--algo=pets"], True),
-        ("train", ["--algo", "sac"], False),
-        ("train", [], False),
-        ("train", ["--algo", "dgp-mpc", "-conf", "own.yml"], False),
-        ("train", ["--algo", "dgp-mpc", "--conf-file=own.yml"], False),
-        ("enjoy", ["--algo", "dgp-mpc"], False),
+        ("train", ["--algo", "dgp-mpc", "--env", "ModCartPole-v0"], "gym_dgpmpc.zoo_dgp-mpc"),
+        ("train", ["--env", "ModCartPole-v0", "--algo=pets"], "gym_dgpmpc.zoo_pets"),
+        ("train", ["--algo", "sac"], None),
+        ("train", [], None),
+        ("train", ["--algo", "dgp-mpc", "-conf", "own.yml"], "own.yml"),
+        ("train", ["--algo", "dgp-mpc", "--conf=own.yml"], "own.yml"),
+        ("enjoy", ["--algo", "dgp-mpc"], None),
     ],
 )
-def test_presets_are_read_where_no_file_is_given(command, arguments, added):
-    found = zoo.with_presets(command, arguments)
-    assert found[: len(arguments)] == arguments
-    assert (found[-2:-1] == ["--conf-file"] and found != arguments) is added
+def test_presets_are_read_where_no_file_is_given(command, arguments, read):
+    parser = argparse.ArgumentParser()  # with the names that the zoo's has
+    for names in (("-conf", "--conf-file"), ("--algo",), ("--env",)):
+        parser.add_argument(*names)
+    assert parser.parse_args(zoo.with_presets(command, arguments)).conf_file == read
+
+
+@pytest.mark.parametrize("algorithm", zoo.ALGORITHMS)
+def test_an_agent_takes_its_presets_as_the_zoo_hands_them_on(algorithm):
+    """Which makes a schedule of a learning rate."""
+    settings = zoo.hyperparameters(algorithm)["ModCartPole-v0"]
+    del settings["n_timesteps"]
+    given = {name: ConstantSchedule(value) if name == "learning_rate" else value for name, value in settings.items()}
+    agent = zoo.ALGORITHMS[algorithm].agent_class(env=PointMass(), **given)
+    del settings["policy"]
+    assert settings.items() <= agent.arguments().items()
 
 
 @pytest.mark.parametrize(

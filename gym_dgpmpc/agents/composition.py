@@ -87,6 +87,21 @@ def _with_own_defaults(agent: MadeOf, settings: Settings) -> dict[str, Setting]:
     return {name: replace(setting, default=changed.get(name, setting.default)) for name, setting in settings.items()}
 
 
+def _constant(schedule: Callable[[float], float]) -> float:
+    """The value of a schedule as Stable-Baselines3 has them, which its RL Zoo makes of every learning rate.
+
+    Raises:
+        ValueError: it is not the same at the beginning, the middle and the end.
+    """
+    first, middle, last = (float(schedule(remaining)) for remaining in (1.0, 0.5, 0.0))
+    if not first == middle == last:
+        raise ValueError(
+            f"learning_rate must be a number or a constant schedule, got one from {first} over {middle} to {last}: "
+            "each training of the model goes through all of its steps, however far the run is"
+        )
+    return first
+
+
 def setting_property(name: str) -> property:
     """A setting as an attribute of the agent; it is decided when the agent is made, so it cannot be set."""
     return property(lambda agent: agent.composition.setting(name))
@@ -126,6 +141,7 @@ class Composition:
 
     Raises:
         TypeError: there is no such setting; or a model was given to an agent that makes its own.
+        ValueError: ``learning_rate`` is a schedule of Stable-Baselines3's that is not constant.
     """
 
     def __init__(
@@ -143,8 +159,10 @@ class Composition:
             )
         known = part_settings(agent, planner)
         refuse_unknown(agent.name, settings, {**known, **other_names})
-        defaults = {name: setting.default for name, setting in known.items()}
-        self.settings: Mapping[str, Any] = MappingProxyType({**defaults, **settings})
+        filled = {name: setting.default for name, setting in known.items()} | dict(settings)
+        if callable(filled.get("learning_rate")):
+            filled["learning_rate"] = _constant(filled["learning_rate"])
+        self.settings: Mapping[str, Any] = MappingProxyType(filled)
 
     @property
     def planner_name(self) -> str | None:

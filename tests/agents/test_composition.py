@@ -19,7 +19,7 @@ from gym_dgpmpc.planning import CEM, PLANNERS, register_planner
 from gym_dgpmpc.planning.registry import PlannerName
 from gym_dgpmpc.planning.risk import RiskMeasure
 from gym_dgpmpc.settings import argument_texts, settings_of
-from tests.agents.point_mass import LENGTH, KnownPointMass, LinearModel, agent, planner
+from tests.agents.point_mass import LENGTH, KnownPointMass, LinearModel, PointMass, agent, planner
 from tests.agents.test_dgp_mpc import TINY
 from tests.checkpoints.common import changed, load
 from tests.planning.toy_planners import RandomShooting
@@ -271,3 +271,10 @@ def test_every_planner_fits_every_agent(agent_class, name):
     """None of its settings has the name of one of the agent or of its model."""
     assert {"horizon", "num_iterations"} <= set(agent_class.saved_settings(name))
     assert set(get_args(PlannerName)) == set(PLANNERS)
+
+
+def test_a_learning_rate_may_be_a_constant_schedule():
+    """As Stable-Baselines3's algorithms take them; another one would be ignored, and is refused."""
+    assert PETSAgent(PointMass(), learning_rate=lambda remaining: 0.02).settings["learning_rate"] == 0.02
+    with pytest.raises(ValueError, match=r"learning_rate must be .* got one from 0\.02 over 0\.01 to 0\.0"):
+        PETSAgent(PointMass(), learning_rate=lambda remaining: 0.02 * remaining)
