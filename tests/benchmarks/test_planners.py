@@ -80,6 +80,6 @@ def test_every_planner_is_measured(dynamics, monkeypatch):
     task = dict(planners.settings_for("ModCartPole-v0"))
     monkeypatch.setattr(planners, "settings_for", lambda env_id: {**task, **small})
     monkeypatch.setattr(planners, "NUM_RECORDED", 1)
-    for planner in planners.OF_VALUES if dynamics == "true" else ("CEM", "gradient from CEM"):
+    for planner in planners.OF_VALUES if dynamics == "true" else ("CEM", "iCEM, beta 1", "MPPI", "gradient from CEM"):
         row = planners.measure({**about, "planner": planner, "num_candidates": 6, "num_iterations": 1})
         assert -3 < row["return"] < 3 and row["plan_cpu_ms"] > 0

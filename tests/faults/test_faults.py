@@ -12,8 +12,8 @@ needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="runs are forked
 
 @needs_fork
 def test_kills_lose_nothing(tmp_path):
-    rows = kills.run_kills(tmp_path, 2)
-    assert sum(count for row in rows for count in row[1].values()) == 2
+    rows = kills.run_kills(tmp_path, 3)
+    assert sum(count for row in rows for count in row[1].values()) == 3
     assert kills.summary(rows)[1] == []
 
 
@@ -69,8 +69,8 @@ def test_environments_in_which_something_else_came_out_once(world, unchecked):
 def test_memory_and_time_stay(tmp_path, monkeypatch):
     monkeypatch.setattr(soak, "ALLOWED_SLOWDOWN", 4.0)  # of few steps, on a machine that does other things too
     gc.collect()
-    found, wrong = soak.run_soak(tmp_path, 16)
-    assert found["episodes"] == 16
+    found, wrong = soak.run_soak(tmp_path, 24)
+    assert found["episodes"] == 24
     assert wrong == []
 
 
