@@ -2,7 +2,7 @@
 
 A variant is given by its settings, "kernel=rbf,planner=icem"; the present defaults are measured beside the variants.
 All pass three stages: forecasts of recorded episodes, the first five planned episodes of the cart-pole, and the first
-four of the half-cheetah; ``--stages`` has more tasks, those without presets for the defaults of the class. Writes
+four of the half-cheetah; ``--stages`` has more tasks, some without their presets, as a user's own. Writes
 `defaults.md` and `defaults.json`; what is in the latter already, with the same settings, is not done again. A row names
 all settings of its agent, so that rows of former defaults stay what they are.
 """
@@ -27,7 +27,7 @@ from benchmarks.calibration.measure import measure as forecast_recorded
 from benchmarks.methods import PlanningMethod
 from benchmarks.report import markdown
 from benchmarks.rows import Row, made_by, measure_missing
-from benchmarks.tasks import NO_PRESETS, TASKS
+from benchmarks.tasks import TASKS
 from gym_dgpmpc.agents import DGPMPCAgent, presets
 from gym_dgpmpc.dynamics.deep_gp.model import DeepGPDynamics
 from gym_dgpmpc.runs.provenance import revision
@@ -46,9 +46,6 @@ LEARNING: Mapping[str, tuple[int, tuple[int, ...]]] = {
     "Reacher-v5:no presets": (10, SEEDS),
 }
 """Planned episodes and seeds of the stages that learn."""
-
-UNKNOWN = tuple(stage for stage in LEARNING if TASKS[stage].preset in ("OutsideCartPole-v0", NO_PRESETS))
-"""Stages in which the defaults of the class are all that there is, as on a user's own task."""
 
 KNOWING = tuple(RECORDED)
 """Recorded tasks, whose forecasts a variant of the planner has in common with the defaults."""

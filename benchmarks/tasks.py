@@ -63,7 +63,7 @@ def _shipped(env_id: str, change: str = "") -> Task:
 
 
 NO_PRESETS = "none"
-"""Of a task that is played as one that nobody has seen before: with the defaults of the agents' classes."""
+"""Of a task that is played as one that nobody has seen before, a user's own."""
 
 
 def _unknown(env_id: str, episode_steps: int) -> Task:
