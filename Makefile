@@ -29,6 +29,7 @@ help:
 
 install: $(INSTALLED)
 
+# Most modules of what is installed are never imported; Python compiles the others when they are.
 $(INSTALLED): pyproject.toml constraints.txt
 	@if ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
 	  command -v $(PYTHON) >/dev/null || \
@@ -39,7 +40,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	    { echo "error: $(PYTHON) cannot make virtual environments; on Debian or Ubuntu: apt-get install python3-venv"; exit 1; }; \
 	  $(PYTHON) -m venv --clear $(VENV); \
 	fi
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[all]'
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-compile --constraint constraints.txt --editable '.[all]'
 	@touch $@
 
 # The defaults, with fewer candidates than the paper has.
